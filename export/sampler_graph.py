@@ -1,0 +1,146 @@
+"""`sampler.onnx`: points in, colour out, as plain ONNX arithmetic (GramGAN Eq. 1, 2 and 5).
+
+The graph is written here operator by operator rather than traced from torch, so that it holds what the formula holds and
+nothing newer than opset 17. There is no GridSample in it (5-D needs opset 20, wraps around nowhere, and several execution
+providers lack it): the trilinear lookup is Gather and arithmetic.
+
+Conventions. P points, n octaves in four bins of q = n/4, m hidden units. `T`, `A`, `W`, `b`, `eta` are the paper's letters.
+The lookup's tensors are [n, P], so that a constant of an octave is a column [n, 1].
+
+Precision. T_i p + o_i is formed in float64, per point, and split into cell and fraction before anything becomes float32:
+the fraction is right at any distance from the origin, whatever the chunk, and no TF32 mode can touch it. Cells are
+integers below 2^24 from there on, exact in float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+import onnx.checker
+import spox
+import spox.opset.ai.onnx.v17 as op
+from spox import Tensor, Var, argument
+
+OPSET = 17
+RESOLUTION = 64  # texels along each axis of a noise table
+SLOPE = 0.2  # of the leaky ReLU (gramgan/models.py)
+
+FloatArray = npt.NDArray[np.float32]
+Triple = Sequence[Var]  # one tensor per axis, x y z
+
+
+def build_sampler_graph(weights: Sequence[FloatArray], biases: Sequence[FloatArray], octaves: int) -> onnx.ModelProto:
+    """The sampler S as an ONNX model: its shared weights inside, everything that a texture owns as an input.
+
+    `weights` and `biases` are the effective ones, learning-rate gains applied. `weights[l - 1]` is [m, m], used as x W, for
+    the hidden layers l = 1..4, and the last is [m, 3]. `biases[l]` is [m] for the hidden layers 0..4, and the last is [3];
+    layer 0 sees nothing but the learned constant, so its whole product is in `biases[0]`.
+    """
+    n, width, depth = octaves, len(biases[0]), len(biases) - 1
+    inputs = {
+        "points": argument(Tensor(np.float64, ("P", 3))),
+        "transforms": argument(Tensor(np.float64, (n, 3, 3))),
+        "offsets": argument(Tensor(np.float64, (n, 3))),
+        "lattice": argument(Tensor(np.float64, (n, 3, 3))),
+        "gamma": argument(Tensor(np.float32, (depth, width))),
+        "delta": argument(Tensor(np.float32, (depth, width))),
+        "noise_weights": argument(Tensor(np.float32, (4, n // 4, width))),
+        "noise": argument(Tensor(np.float32, (n, RESOLUTION, RESOLUTION, RESOLUTION))),
+    }
+    cells, fractions = _locate(inputs["points"], inputs["transforms"], inputs["offsets"])
+    eta = _look_up(inputs["noise"], cells, fractions, inputs["lattice"], n)
+    rgb = _perceptron(eta, inputs["noise_weights"], inputs["gamma"], inputs["delta"], weights, biases, n)
+    model = spox.build(inputs, {"rgb": rgb})
+    model.producer_name = "solidgrain"
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def _locate(points: Var, transforms: Var, offsets: Var) -> tuple[Triple, Triple]:
+    """c_i = T_i p + o_i, split: cells (float64, integers) and fractions (float32), along each axis [n, P]."""
+    cells, fractions = [], []
+    for axis in range(3):
+        row = op.gather(transforms, op.const(axis), axis=1)  # [n, 3]
+        offset = op.gather(offsets, op.const([axis]), axis=1)  # [n, 1]
+        coordinate = op.gemm(row, points, offset, transB=1)
+        cell = op.floor(coordinate)
+        cells.append(cell)
+        fractions.append(op.cast(op.sub(coordinate, cell), to=np.float32))
+    return cells, fractions
+
+
+def _look_up(noise: Var, cells: Triple, fractions: Triple, lattice: Var, octaves: int) -> Var:
+    """eta_i(c) of Eq. 1, [n, P]: trilinear between eight texels, each found through the octave's lattice."""
+    table = op.reshape(noise, op.const([-1]))
+    entries = op.reshape(lattice, op.const([octaves, 9]))
+    basis = [[op.gather(entries, op.const([3 * row + column]), axis=1) for column in range(3)] for row in range(3)]
+    for axis in range(3):
+        cells = _reduce(cells, basis, axis)
+    cells = [op.cast(cell, to=np.float32) for cell in cells]
+    basis = [[op.cast(entry, to=np.float32) for entry in row] for row in basis]
+
+    def interpolate(cell: Triple, axis: int, index: Var) -> Var:
+        """The value between the two neighbours along `axis`, each of them interpolated along the axes that follow."""
+        if axis == 3:
+            found = op.gather_elements(table, op.reshape(op.cast(index, to=np.int32), op.const([-1])))
+            return op.reshape(found, op.const([octaves, -1]))
+        ends = []
+        for neighbour in (cell[axis], op.add(cell[axis], op.const(np.float32(1)))):
+            corner = _reduce([*cell[:axis], neighbour, *cell[axis + 1 :]], basis, axis)
+            texel = _modulo(corner[axis], op.const(np.float32(RESOLUTION)))
+            ends.append(interpolate(corner, axis + 1, op.add(op.mul(index, op.const(np.float32(RESOLUTION))), texel)))
+        return op.add(ends[0], op.mul(op.sub(ends[1], ends[0]), fractions[axis]))
+
+    return interpolate(cells, 0, op.const(np.arange(octaves, dtype=np.float32)[:, None]))
+
+
+def _reduce(cell: Triple, basis: Sequence[Triple], axis: int) -> Triple:
+    """One step towards the canonical representative of a cell modulo its octave's lattice.
+
+    The basis is lower triangular: column k has its pivot in row k and zeros above, so one floor division per axis, in
+    order, is the whole reduction. Without tiling the basis is 64 times the identity.
+    """
+    turns = op.floor(op.div(cell[axis], basis[axis][axis]))
+    moved = [op.sub(cell[row], op.mul(turns, basis[row][axis])) for row in range(axis, 3)]
+    return [*cell[:axis], *moved]
+
+
+def _modulo(value: Var, divisor: Var) -> Var:
+    return op.sub(value, op.mul(op.floor(op.div(value, divisor)), divisor))
+
+
+def _perceptron(
+    eta: Var,
+    noise_weights: Var,
+    gamma: Var,
+    delta: Var,
+    weights: Sequence[FloatArray],
+    biases: Sequence[FloatArray],
+    octaves: int,
+) -> Var:
+    """Eq. 5, y = gamma * phi(W x + A eta + b) + delta, with the style folded into the layer that follows.
+
+    W (gamma * y + delta) + b = (W diag(gamma)) y + (W delta + b): the fold costs a few small products per run instead of
+    two passes over [P, m] per layer. Bin l of the octaves enters hidden layer l;
+    the last hidden layer gets none.
+    """
+    bins = op.split(eta, op.const([octaves // 4] * 4), outputs_count=4, axis=0)  # [q, P] each
+    hidden = None
+    for layer, bias_values in enumerate(biases):
+        bias: Var = op.const(bias_values)
+        if layer > 0:
+            weight = op.const(weights[layer - 1])  # [m, m], x W
+            scale = op.gather(gamma, op.const([layer - 1]), axis=0)  # [1, m]
+            shift = op.gather(delta, op.const([layer - 1]), axis=0)
+            bias = op.gemm(shift, weight, bias)
+            weight = op.mul(op.transpose(scale, perm=[1, 0]), weight)
+        if layer < 4:
+            bias = op.gemm(bins[layer], op.gather(noise_weights, op.const(layer), axis=0), bias, transA=1)
+        hidden = bias if hidden is None else op.gemm(hidden, weight, bias)
+        if layer < len(biases) - 1:
+            hidden = op.leaky_relu(hidden, alpha=SLOPE)
+    assert hidden is not None
+    return hidden

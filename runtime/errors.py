@@ -1,0 +1,42 @@
+"""The errors that solidgrain raises for what a user can mend.
+
+    SolidgrainError
+      BundleError       a bundle or texture file that is missing, damaged or of another version
+      ExemplarError     a photograph that cannot be learned from
+      TrainingError     a training run that cannot start, go on or be read
+      ProviderError     an ONNX Runtime execution provider that was asked for and cannot be had
+      BakeError         a bake that cannot be done as asked
+      ViewError         a volume that cannot be shown
+
+Each message is one line: the flag or file, what was expected, what was found, what to do next.
+"""
+
+from __future__ import annotations
+
+
+class SolidgrainError(Exception):
+    """Base of all errors that solidgrain raises on purpose."""
+
+
+class BundleError(SolidgrainError):
+    """A bundle or texture file is missing, damaged, incomplete or of another version."""
+
+
+class ExemplarError(SolidgrainError):
+    """A photograph is missing, unreadable, too small or too large."""
+
+
+class TrainingError(SolidgrainError):
+    """A training run cannot start, go on or be read."""
+
+
+class ProviderError(SolidgrainError):
+    """The execution provider that was asked for cannot be had. There is no silent fall-back."""
+
+
+class BakeError(SolidgrainError):
+    """A bake cannot be done as asked."""
+
+
+class ViewError(SolidgrainError):
+    """A volume cannot be read or shown."""

@@ -1,0 +1,214 @@
+"""The training loop (Sec. 3.1): one step of the critic, one of the sampler, and nothing hidden between them."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from solidgrain.runtime.errors import TrainingError
+from solidgrain.train.critic import Critic
+from solidgrain.train.exemplar import draw_patches
+from solidgrain.train.losses import gradient_penalty, style_loss
+from solidgrain.train.noise import draw_tables
+from solidgrain.train.preview import write_preview
+from solidgrain.train.run import Run
+from solidgrain.train.sampler import Sampler
+from solidgrain.train.settings import Settings, rate
+from solidgrain.train.slices import draw_slices
+
+PARTS = ("critic", "sampler", "average", "critic_optimiser", "sampler_optimiser")  # what a checkpoint holds
+
+
+@dataclass(frozen=True)
+class Budget:
+    """When to stop: after that many iterations or minutes of training in all, whichever comes first."""
+
+    iterations: int | None = None
+    minutes: float | None = None
+
+    def done(self, iteration: int, seconds: float) -> bool:
+        return self.progress(iteration, seconds) >= 1.0
+
+    def progress(self, iteration: int, seconds: float) -> float:
+        """The share of the budget that is spent."""
+        by_iteration = iteration / self.iterations if self.iterations else 0.0
+        by_time = seconds / (60 * self.minutes) if self.minutes else 0.0
+        return max(by_iteration, by_time)
+
+
+@dataclass(frozen=True)
+class Report:
+    """One line of `stats.jsonl`."""
+
+    iteration: int
+    seconds: float  # of training so far, earlier sittings included
+    critic_loss: float  # L_D
+    penalty: float | None  # where this iteration had one
+    style: float  # L_style
+    adversarial: float  # E[D(f)]
+
+
+class Trainer:
+    """The state of a training: networks, optimisers, random streams. `train` drives it."""
+
+    def __init__(self, run: Run, device: torch.device) -> None:
+        self.run, self.settings, self.device = run, run.settings, device
+        self.generator = torch.Generator(device).manual_seed(self.settings.seed)
+        self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
+        self.critic = Critic(self.generator).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.sampler = Sampler(self.settings, self.generator)
+        self.average = copy.deepcopy(self.sampler).requires_grad_(False)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), betas=(0.5, 0.999))
+        self.sampler_optimiser = torch.optim.Adam(self.sampler.parameters(), betas=(0.5, 0.999))
+        self.reduced_precision = use_bfloat16(self.settings, device)
+        self.iteration, self.seconds = 0, 0.0
+
+    def step(self) -> Report:
+        """One iteration: synthesise slices, improve the critic on them, then the sampler against it."""
+        settings = self.settings
+        self._set_rates()
+        fake = self.synthesise()  # (B, 3, patch, patch)
+        real = draw_patches(self.exemplar, settings, self.generator)
+
+        critic_loss, penalty = self._critic_loss(real, fake.detach())
+        self.critic_optimiser.zero_grad()
+        critic_loss.backward()
+        self.critic_optimiser.step()
+
+        self.critic.requires_grad_(False)  # the sampler's step needs its activations, not its gradients
+        style, adversarial = self._sampler_losses(real, fake)
+        self.sampler_optimiser.zero_grad()
+        (settings.beta * style - settings.alpha * adversarial).backward()
+        self.sampler_optimiser.step()
+        self.critic.requires_grad_(True)
+
+        self._update_average()
+        self.iteration += 1
+        return Report(
+            iteration=self.iteration,
+            seconds=self.seconds,
+            critic_loss=critic_loss.item(),
+            penalty=None if penalty is None else penalty.item(),
+            style=style.item(),
+            adversarial=adversarial.item(),
+        )
+
+    def synthesise(self) -> Tensor:
+        """A batch of random slices of one fresh noise instance, as images."""
+        settings = self.settings
+        tables = draw_tables(settings.octaves, settings.resolution, self.generator)
+        with self._autocast():
+            rgb = self.sampler(tables, draw_slices(settings, self.generator))
+        return rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
+
+    def _critic_loss(self, real: Tensor, fake: Tensor) -> tuple[Tensor, Tensor | None]:
+        """L_D of Eq. 3 with the authors' drift term, and its gradient penalty alone when this iteration has one."""
+        settings = self.settings
+        with self._autocast():
+            logits, _ = self.critic(torch.cat([fake, real]))
+        on_fake, on_real = logits.float().chunk(2)
+        loss = on_fake.mean() - on_real.mean() + settings.drift * (on_real**2).mean()
+        if (self.iteration + 1) % settings.penalty_every:
+            return loss, None
+        penalty = gradient_penalty(self.critic, real, fake, self.generator)
+        return loss + settings.penalty * settings.penalty_every * penalty, penalty
+
+    def _sampler_losses(self, real: Tensor, fake: Tensor) -> tuple[Tensor, Tensor]:
+        """L_style and E[D(f)] of Eq. 4."""
+        with self._autocast():
+            on_fake, of_fake = self.critic(fake)
+            with torch.no_grad():
+                _, of_real = self.critic(real)
+        return style_loss(of_real, of_fake, self.settings.pooled_gram), on_fake.float().mean()
+
+    def _set_rates(self) -> None:
+        s = self.settings
+        for group in self.critic_optimiser.param_groups:
+            group["lr"] = rate(s.critic_rate, s.critic_rate_floor, s.critic_half_life, self.iteration)
+        for group in self.sampler_optimiser.param_groups:
+            group["lr"] = rate(s.sampler_rate, s.sampler_rate_floor, s.sampler_half_life, self.iteration)
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        """Exponential moving average of the weights, with a short memory at the start."""
+        keep = min(self.settings.average_decay, (1 + self.iteration) / (10 + self.iteration))
+        for average, current in zip(self.average.parameters(), self.sampler.parameters(), strict=True):
+            average.lerp_(current, 1 - keep)
+
+    def _autocast(self) -> AbstractContextManager[None]:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.reduced_precision)
+
+    def save(self) -> None:
+        parts = {name: getattr(self, name).state_dict() for name in PARTS}
+        progress = {"iteration": self.iteration, "seconds": self.seconds}
+        self.run.save_checkpoint(parts | progress | {"generator": self.generator.get_state()})
+
+    def load(self) -> None:
+        """Take up the run's last checkpoint, if it has one."""
+        state = self.run.load_checkpoint()
+        if state is None:
+            return
+        self.iteration, self.seconds = state["iteration"], state["seconds"]
+        for name in PARTS:
+            getattr(self, name).load_state_dict(state[name])
+        self.generator.set_state(state["generator"])
+
+
+def train(
+    run: Run,
+    budget: Budget,
+    device: torch.device,
+    on_report: Callable[[Report], None] = lambda report: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Report | None:
+    """Train until the budget is spent or `should_stop` says so, from the run's last checkpoint if there is one.
+
+    Leaves a checkpoint and a sample behind in either case. Raises TrainingError when the losses stop being finite; the
+    last checkpoint is then the way back.
+    """
+    trainer = Trainer(run, device)
+    trainer.load()
+    run.rewind_stats(trainer.iteration)
+    settings, report = run.settings, None
+
+    started = time.monotonic() - trainer.seconds
+    while not budget.done(trainer.iteration, trainer.seconds) and not should_stop():
+        report = trainer.step()
+        trainer.seconds = time.monotonic() - started
+        if not math.isfinite(report.critic_loss + report.style):
+            raise TrainingError(
+                f"{run.folder}: the training diverged at iteration {report.iteration} (losses are not finite); "
+                f"the last checkpoint is intact: export it, or train again with another --seed"
+            )
+        if trainer.iteration % settings.report_every == 0:
+            run.append_stats(vars(report))
+            on_report(report)
+        if trainer.iteration % settings.sample_every == 0:
+            _write_sample(trainer)
+        if trainer.iteration % settings.checkpoint_every == 0:
+            trainer.save()
+    trainer.save()
+    _write_sample(trainer)
+    return report
+
+
+def use_bfloat16(settings: Settings, device: torch.device) -> bool:
+    """Whether plain forward passes run in bfloat16: only where the processor multiplies it natively, unless told so."""
+    if settings.precision != "auto":
+        return settings.precision == "bfloat16"
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
+
+
+def _write_sample(trainer: Trainer) -> None:
+    path = trainer.run.folder / "samples" / f"{trainer.iteration:06d}.png"
+    write_preview(path, trainer.average, trainer.settings, trainer.run.exemplar, trainer.device)
+

@@ -1,0 +1,70 @@
+"""The sampler S: noise octaves in, colour out (Sec. 3.1, Eq. 1 and 2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from solidgrain.train.layers import Linear, activate
+from solidgrain.train.noise import look_up
+from solidgrain.train.settings import Settings
+
+HIDDEN_LAYERS = 5
+BINS = 4  # consecutive bins of octaves; bin l enters hidden layer l, the last hidden layer gets none
+
+
+class Sampler(nn.Module):
+    """An MLP on a learned constant, with a quarter of the octaves injected into each of its first four hidden layers."""
+
+    octave_scale: Tensor
+
+    def __init__(self, settings: Settings, generator: torch.Generator) -> None:
+        super().__init__()
+        n, m = settings.octaves, settings.width
+        self.directions = nn.Parameter(_start_directions(settings, generator))  # [n, 3, 3]
+        self.register_buffer("octave_scale", _octave_scale(settings).to(generator.device))  # [n, 3, 3] or [n, 1, 1]
+        self.constant = nn.Parameter(torch.ones(m, device=generator.device))
+        self.hidden = nn.ModuleList(Linear(m, m, generator) for _ in range(HIDDEN_LAYERS))
+        shape = (BINS, n // BINS, m)
+        noise_weights = torch.randn(shape, generator=generator, device=generator.device)
+        self.noise_weights = nn.Parameter(settings.noise_weight_start * noise_weights)  # A of Eq. 2, transposed
+        self.output = Linear(m, 3, generator, gain=1.0)
+
+    def transforms(self) -> Tensor:
+        """T_i [n, 3, 3], on coordinates in units of 64 pixels."""
+        return self.directions * self.octave_scale
+
+    def forward(self, tables: Tensor, points: Tensor) -> Tensor:
+        """Colour at points: tables [n, R, R, R], points [B, P, 3] -> rgb [B, P, 3], not clipped to [0, 1]."""
+        eta = look_up(tables, self.transforms(), points)  # (B, P, n)
+        bins = eta.chunk(BINS, dim=-1)
+        x = self.constant
+        for layer, dense in enumerate(self.hidden):
+            y = dense(x)
+            if layer < BINS:
+                y = y + bins[layer] @ self.noise_weights[layer]  # psi(eta) = A eta
+            x = activate(y)
+        rgb: Tensor = self.output(x)
+        return rgb
+
+
+def _octave_scale(settings: Settings) -> Tensor:
+    """2^(span i / (n - 1)), times the start of the grain: structures are longer along the axis that slices turn about."""
+    exponents = torch.arange(settings.octaves) * settings.octave_span / (settings.octaves - 1)
+    stretch = torch.ones(3)
+    if settings.grain != "none":
+        stretch["xy".index(settings.grain)] = settings.grain_ratio
+    return (2.0**exponents)[:, None, None] * stretch  # scales the columns: T diag(stretch)
+
+
+def _start_directions(settings: Settings, generator: torch.Generator) -> Tensor:
+    """N(0,1)^{3x3} as in the paper, or random orthogonal matrices.
+
+    Gaussian matrices shear most octaves into streaks that training has to unlearn at the pace of the learning rate;
+    orthogonal ones start isotropic.
+    """
+    gaussian = torch.randn(settings.octaves, 3, 3, generator=generator, device=generator.device)
+    if not settings.orthogonal_start:
+        return gaussian
+    orthogonal: Tensor = torch.linalg.qr(gaussian)[0]
+    return orthogonal

@@ -1,0 +1,106 @@
+"""Every setting of a training run, the two presets, and how they are saved beside the result."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Literal
+
+from solidgrain.runtime.errors import TrainingError
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run depends on besides its exemplar and its budget; saved as `options.json`.
+
+    Rates follow `rate(k) = max(floor, start * 0.5 ** (k / half_life))` at iteration k; a half-life of 0 keeps them constant.
+    """
+
+    preset: str = "fast"
+    seed: int = 0
+
+    # Sampler (Sec. 3.1)
+    octaves: int = 16  # n
+    width: int = 128  # hidden units m of each of the five hidden layers
+    resolution: int = 64  # texels along each axis of a noise table
+    octave_span: float = 7.0  # octave i scales by 2 ** (span * i / (n - 1))
+    orthogonal_start: bool = True  # T_i starts as a random orthogonal matrix, else N(0,1)^{3x3}
+    noise_weight_start: float = 0.5  # standard deviation of A at the start
+
+    # Slices (Sec. 4, implementation details)
+    patch: int = 64  # pixels along each side of a patch
+    batch: int = 4
+    rotations: Literal["uniform", "euler"] = "uniform"  # uniform on SO(3), or the authors' three angles in [0°, 90°]
+    grain: Literal["none", "x", "y"] = "none"  # the image axis about which slices turn; "none" turns them freely
+    grain_ratio: float = 1.0  # length of the structures across the grain over along it, at the start
+
+    # Losses (Eq. 3, Eq. 4)
+    alpha: float = 0.1  # weight of the adversarial term in L_G
+    beta: float = 1.0  # weight of L_style
+    penalty: float = 10.0  # lambda, weight of the gradient penalty
+    penalty_every: int = 4  # iterations between penalties, each weighted that much more (lazy regularisation, StyleGAN2)
+    drift: float = 0.001  # weight of E[D(r)^2] (gramgan/main.py; not in the paper)
+    pooled_gram: bool = True  # compare the Gram matrices of the whole batch, else patch by patch
+
+    # Optimisation
+    critic_rate: float = 2e-3
+    critic_rate_floor: float = 1e-3
+    critic_half_life: float = 1000.0
+    sampler_rate: float = 2e-3
+    sampler_rate_floor: float = 4e-4
+    sampler_half_life: float = 400.0
+    average_decay: float = 0.995  # of the exponential moving average whose weights are all output
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+
+    # Reporting
+    checkpoint_every: int = 250  # iterations
+    sample_every: int = 500
+    report_every: int = 20
+
+
+FAST = Settings()
+"""Tuned for few CPU minutes. How it departs from the paper, and why, is in docs/training.md."""
+
+PAPER = Settings(
+    preset="paper",
+    octave_span=15.0,
+    orthogonal_start=False,
+    noise_weight_start=1.0,
+    patch=128,
+    batch=16,
+    rotations="euler",
+    penalty_every=1,
+    pooled_gram=False,
+    critic_rate_floor=2e-3,
+    critic_half_life=0.0,
+    sampler_rate=5e-4,
+    sampler_rate_floor=5e-4,
+    sampler_half_life=0.0,
+    average_decay=0.999,
+)
+"""The settings of the paper and of the authors' code: 128² patches, batch 16, T ~ N(0,1) 2^i, constant rates."""
+
+PRESETS = {"fast": FAST, "paper": PAPER}
+PRESET_ITERATIONS = {"fast": 2000, "paper": 100_000}
+
+
+def preset(name: str, **changes: Any) -> Settings:
+    """The named preset with some of its settings replaced."""
+    return replace(PRESETS[name], **changes)
+
+
+def rate(start: float, floor: float, half_life: float, iteration: int) -> float:
+    """The learning rate at an iteration (see `Settings`)."""
+    return start if half_life == 0 else max(floor, start * 0.5 ** (iteration / half_life))
+
+
+def to_json(settings: Settings) -> dict[str, Any]:
+    return asdict(settings)
+
+
+def from_json(values: dict[str, Any]) -> Settings:
+    """Settings back from `options.json`. Raises TrainingError if it names a setting that does not exist."""
+    unknown = set(values) - {field.name for field in fields(Settings)}
+    if unknown:
+        raise TrainingError(f"options.json: unknown settings {json.dumps(sorted(unknown))}; written by another version?")
+    return Settings(**values)

@@ -1,0 +1,66 @@
+"""Random planes through the solid (Sec. 3.1: "our model synthesizes 2D images by randomly slicing the 3D space")."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from solidgrain.train.settings import Settings
+
+UNIT = 64.0  # pixels per unit of the coordinates that the octaves act on
+
+
+def draw_slices(settings: Settings, generator: torch.Generator) -> Tensor:
+    """Points of `batch` randomly turned and shifted planes, [B, patch², 3], rows of the image first."""
+    flat = flat_slice(settings.patch, generator.device)
+    centred = flat - settings.patch / (2 * UNIT) * torch.tensor([1.0, 1.0, 0.0], device=flat.device)
+    turned = torch.einsum("bij,pj->bpi", draw_rotations(settings, generator), centred)
+    shift = torch.rand(settings.batch, 1, 3, generator=generator, device=generator.device)
+    return turned + (2 * shift - 1)
+
+
+def flat_slice(size: int, device: torch.device) -> Tensor:
+    """The points [size², 3] of an axis-aligned square: x along the image's rows, y down its columns, z = 0."""
+    ticks = torch.arange(size, device=device) / UNIT
+    y, x = torch.meshgrid(ticks, ticks, indexing="ij")
+    return torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
+
+
+def draw_rotations(settings: Settings, generator: torch.Generator) -> Tensor:
+    """Rotation matrices [B, 3, 3]: free for isotropic materials, about the grain's axis for anisotropic ones.
+
+    The paper asks for "all possible slice orientations"; its code draws three Euler angles from [0°, 90°], which favours
+    some. "uniform" draws from SO(3) evenly, through unit quaternions.
+    """
+    batch, device = settings.batch, generator.device
+    if settings.grain != "none":
+        angles = 2 * math.pi * torch.rand(batch, generator=generator, device=device)
+        return about_axis("xyz".index(settings.grain), angles)
+    if settings.rotations == "euler":
+        angles = 0.5 * math.pi * torch.rand(3, batch, generator=generator, device=device)
+        return about_axis(2, angles[2]) @ about_axis(1, angles[1]) @ about_axis(0, angles[0])
+    return from_quaternions(F.normalize(torch.randn(batch, 4, generator=generator, device=device), dim=1))
+
+
+def about_axis(axis: int, angles: Tensor) -> Tensor:
+    """Right-handed rotations [B, 3, 3] by angles [B] (radians) about one coordinate axis."""
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    rotations = torch.eye(3, device=angles.device).repeat(len(angles), 1, 1)
+    rotations[:, j, j] = rotations[:, k, k] = angles.cos()
+    rotations[:, k, j] = angles.sin()
+    rotations[:, j, k] = -angles.sin()
+    return rotations
+
+
+def from_quaternions(quaternions: Tensor) -> Tensor:
+    """Unit quaternions (w, x, y, z) [B, 4] -> rotation matrices [B, 3, 3]."""
+    w, x, y, z = quaternions.unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
