@@ -5,6 +5,7 @@
       ExemplarError     a photograph that cannot be learned from
       TrainingError     a training run that cannot start, go on or be read
       ProviderError     an ONNX Runtime execution provider that was asked for and cannot be had
+      EvaluationError   a sampler that returns NaN, or coordinates that it cannot take
       BakeError         a bake that cannot be done as asked
       ViewError         a volume that cannot be shown
 
@@ -32,6 +33,10 @@ class TrainingError(SolidgrainError):
 
 class ProviderError(SolidgrainError):
     """The execution provider that was asked for cannot be had. There is no silent fall-back."""
+
+
+class EvaluationError(SolidgrainError):
+    """The sampler returned NaN, or was asked for something that it cannot evaluate."""
 
 
 class BakeError(SolidgrainError):

@@ -12,9 +12,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -47,6 +49,7 @@ class Run:
     settings: Settings
     provenance: Provenance
     exemplar: FloatArray
+    revision: str  # of solidgrain when the run was started
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         with _replacing(self.folder / CHECKPOINT) as file:
@@ -67,6 +70,12 @@ class Run:
         with open(self.folder / STATS, "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
+    def last_stats(self) -> dict[str, Any]:
+        """The last line of the statistics, empty before the first."""
+        path = self.folder / STATS
+        lines = path.read_text("utf-8").splitlines() if path.exists() else []
+        return dict(json.loads(lines[-1])) if lines else {}
+
     def rewind_stats(self, iteration: int) -> None:
         """Drop the lines after a checkpoint's iteration: a resumed run writes them again."""
         path = self.folder / STATS
@@ -85,12 +94,13 @@ def create_run(folder: Path, settings: Settings, exemplar: FloatArray, name: str
         (folder / "samples").mkdir(parents=True, exist_ok=True)
         with _replacing(folder / EXEMPLAR) as file:
             np.save(file, exemplar)
-        options = {"settings": settings_module.to_json(settings), "provenance": vars(provenance)}
+        revision = source_revision()
+        options = {"settings": settings_module.to_json(settings), "provenance": vars(provenance), "revision": revision}
         with _replacing(folder / OPTIONS) as file:
             file.write(json.dumps(options, indent=2).encode() + b"\n")
     except OSError as error:
         raise TrainingError(f"{folder}: cannot write the run directory ({error.strerror})") from error
-    return Run(folder, settings, provenance, exemplar)
+    return Run(folder, settings, provenance, exemplar, revision)
 
 
 def open_run(folder: Path) -> Run:
@@ -106,7 +116,17 @@ def open_run(folder: Path) -> Run:
         raise TrainingError(f"{folder}: damaged run directory ({error}); start the run again elsewhere") from error
     if hashlib.sha256(exemplar.tobytes()).hexdigest() != provenance.sha256:
         raise TrainingError(f"{folder / EXEMPLAR}: not the pixels that the run was started with (sha256 differs)")
-    return Run(folder, settings, provenance, exemplar)
+    return Run(folder, settings, provenance, exemplar, str(options["revision"]))
+
+
+def source_revision() -> str:
+    """The version of solidgrain, with the git revision where it runs from a checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    try:
+        described = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return version("solidgrain")
+    return f"{version('solidgrain')} ({described})"
 
 
 def _iteration_of(line: str) -> float:

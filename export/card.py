@@ -1,0 +1,33 @@
+"""The model card: what a bundle was trained on and how, as a page of Markdown beside its graphs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+QUALITY = "## Quality"
+
+
+def write_card(name: str, training: dict[str, Any]) -> str:
+    """The card of a bundle, from its manifest's training record."""
+    settings = training["settings"]
+    rows = [
+        ("settings", f"preset `{settings['preset']}`, seed {settings['seed']}"),
+        ("patches", f"{settings['batch']} of {settings['patch']}² pixels per iteration"),
+        ("octaves", f"{settings['octaves']}, span {settings['octave_span']:g}"),
+        ("slices", "turned freely" if settings["grain"] == "none" else f"turned about the {settings['grain']} axis only"),
+        ("iterations", f"{training['iterations']:,}"),
+        ("minutes", f"{training['minutes']:g}"),
+        ("trained by", f"solidgrain {training['revision']}"),
+    ]
+    exemplars = [
+        f"- `{entry['exemplar']}`, licence: {entry['license'] or 'not stated'}, credit: {entry['credit'] or 'not stated'}\n"
+        f"  (sha256 of its pixels `{entry['sha256'][:16]}…`)"
+        for entry in training["exemplars"]
+    ]
+    lines = [f"# {name}", "", "A solid texture trained on:", "", *exemplars, "", "| | |", "|---|---|"]
+    return "\n".join([*lines, *(f"| {label} | {value} |" for label, value in rows), ""])
+
+
+def with_quality(card: str, table: str) -> str:
+    """The card with its quality section written anew."""
+    return card.split(QUALITY)[0].rstrip() + f"\n\n{QUALITY}\n\n{table.rstrip()}\n"

@@ -1,0 +1,29 @@
+"""`solidgrain export`: a training run becomes a bundle."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="a folder made by solidgrain train")
+    parser.add_argument("--out", type=Path, required=True, metavar="BUNDLE", help="the bundle folder to write")
+    parser.add_argument("--name", default="", help="name of the texture (default: the bundle folder's name)")
+    parser.add_argument("--overwrite", action="store_true", help="replace the bundle if it exists")
+    parser.add_argument("--json", action="store_true", help="print the bundle's manifest on stdout")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from solidgrain.export.from_run import export_run
+    from solidgrain.runtime.bundle import open_bundle
+
+    folder = export_run(arguments.run, arguments.out, arguments.name, arguments.overwrite)
+    if arguments.json:
+        print(json.dumps(open_bundle(folder).manifest, indent=2))
+    else:
+        size = sum(path.stat().st_size for path in folder.iterdir())
+        print(f"{folder}: {size / 1024:.0f} KB; bake it with solidgrain bake {folder} --size 128 --out out.vti", file=sys.stderr)
+    return 0

@@ -1,0 +1,98 @@
+"""From a run directory to a bundle: the averaged weights, their provenance, and a proof that ONNX Runtime agrees."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from solidgrain.export.bundle import Details, DoubleArray, SamplerWeights, run_graph, write_bundle
+from solidgrain.export.card import write_card
+from solidgrain.export.sampler_graph import build_sampler_graph
+from solidgrain.runtime.errors import TrainingError
+from solidgrain.runtime.noise import noise_tables
+from solidgrain.runtime.texture_file import TextureData
+from solidgrain.train.run import Run, open_run
+from solidgrain.train.sampler import Sampler
+from solidgrain.train.settings import to_json
+from solidgrain.train.slices import UNIT
+
+TOLERANCE = 1e-4  # largest difference in colour between torch and ONNX Runtime
+
+
+def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = False) -> Path:
+    """Export a run's averaged weights as a single-exemplar bundle called `name`, by default the folder's own name.
+
+    Raises TrainingError if the run has no checkpoint yet, or if torch and ONNX Runtime disagree by more than `TOLERANCE`
+    near the origin or far from it; BundleError if the bundle cannot be written.
+    """
+    run = open_run(run_folder)
+    state = run.load_checkpoint()
+    if state is None:
+        raise TrainingError(f"{run_folder}: no checkpoint yet; let solidgrain train --resume {run_folder} go on for a while")
+    average = Sampler(run.settings, torch.Generator())
+    average.load_state_dict(state["average"])
+    weights = sampler_weights(average)
+    check_agreement(average, weights)
+    training = provenance(run, state)
+    name = name or out.name
+    card = write_card(name, training)
+    details = Details(name=name, patch=run.settings.patch, training=training, card=card)
+    return write_bundle(out, weights, details, overwrite)
+
+
+@torch.no_grad()
+def sampler_weights(sampler: Sampler) -> SamplerWeights:
+    """A torch sampler as plain arrays. A single exemplar has no style: gamma is one and delta zero (Eq. 5)."""
+    layers = [*sampler.hidden, sampler.output]
+    weights = [layer.effective_weight().T.numpy() for layer in layers]  # x W
+    biases = [layer.bias.numpy() for layer in layers]
+    biases[0] = sampler.constant.numpy() @ weights[0] + biases[0]
+    shape = (len(sampler.hidden), len(sampler.constant))
+    return SamplerWeights(
+        weights=weights[1:],
+        biases=biases,
+        transforms=copy.deepcopy(sampler).double().transforms().numpy() / UNIT,
+        noise_weights=sampler.noise_weights.numpy(),
+        gamma=np.ones(shape, np.float32),
+        delta=np.zeros(shape, np.float32),
+    )
+
+
+@torch.no_grad()
+def check_agreement(sampler: Sampler, weights: SamplerWeights, seed: int = 1) -> float:
+    """The largest difference in colour between torch, in float64, and ONNX Runtime over random points near and far.
+
+    Raises TrainingError if it exceeds `TOLERANCE`.
+    """
+    octaves = len(weights.transforms)
+    texture = TextureData("", "", weights.transforms, weights.gamma, weights.delta, weights.noise_weights)
+    model = build_sampler_graph(weights.weights, weights.biases, octaves)
+    exact, tables = copy.deepcopy(sampler).double(), torch.from_numpy(noise_tables(seed, octaves)).double()
+    points = _random_points(seed)
+    expected = exact(tables, torch.from_numpy(points / UNIT)[None])[0].numpy()
+    worst = float(np.abs(run_graph(model, texture, points, seed) - expected).max())
+    if not worst <= TOLERANCE:
+        raise TrainingError(f"torch and ONNX Runtime differ by {worst:.2g} in colour, expected at most {TOLERANCE:g}")
+    return worst
+
+
+def _random_points(seed: int) -> DoubleArray:
+    """Points within 64, 10^4 and 10^9 pixels of the origin, 2048 of each."""
+    draw = np.random.default_rng(seed).uniform(-1, 1, (3, 2048, 3))
+    return (draw * np.array([64.0, 1e4, 1e9])[:, None, None]).reshape(-1, 3)
+
+
+def provenance(run: Run, state: dict[str, Any]) -> dict[str, Any]:
+    """What the manifest says about the training."""
+    return {
+        "exemplars": [vars(run.provenance)],
+        "iterations": state["iteration"],
+        "minutes": round(state["seconds"] / 60, 1),
+        "revision": run.revision,
+        "settings": to_json(run.settings),
+        "losses": run.last_stats(),
+    }

@@ -1,0 +1,110 @@
+"""Bundles on disk: a folder with ONNX graphs, a texture and the manifest that vouches for them.
+
+    manifest.json      format and version, octaves and widths, sha256 of every file, a probe, training provenance
+    sampler.onnx       points -> colour; everything that a texture owns is an input
+    texture.sgt.npz    the texture of a single-exemplar bundle
+    card.md            the model card (optional)
+
+Everything is checked on load, and an error says which file is wrong, what was expected and what was found.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from solidgrain.runtime.errors import BundleError
+
+MANIFEST, SAMPLER, TEXTURE, CARD = "manifest.json", "sampler.onnx", "texture.sgt.npz", "card.md"
+FORMAT, FORMAT_VERSION = "solidgrain-bundle", 1
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A bundle whose files are all present and are the ones that its manifest lists."""
+
+    folder: Path
+    manifest: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        return str(self.manifest["name"])
+
+    @property
+    def sampler_sha256(self) -> str:
+        return str(self.manifest["files"][SAMPLER])
+
+
+def open_bundle(folder: Path) -> Bundle:
+    """Read and verify a bundle folder. Raises BundleError naming the file that is wrong."""
+    manifest = _read_manifest(folder / MANIFEST)
+    for name, expected in manifest["files"].items():
+        path = folder / name
+        if not path.is_file():
+            raise BundleError(f"{path}: missing; the manifest lists it. Export the bundle again")
+        found = file_sha256(path)
+        if found != expected:
+            raise BundleError(
+                f"{path}: sha256 is {found[:12]}…, the manifest expects {expected[:12]}…; "
+                "the file is damaged or belongs to another bundle"
+            )
+    return Bundle(folder, manifest)
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise BundleError(f"{path.parent}: not a bundle (no {MANIFEST}); expected a folder made by solidgrain export")
+    try:
+        manifest = json.loads(path.read_text("utf-8"))
+        is_bundle = manifest["format"] == FORMAT
+        version = manifest["format_version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise BundleError(f"{path}: not a bundle manifest ({error}); export the bundle again") from error
+    if not is_bundle:
+        raise BundleError(f"{path}: format is {manifest['format']!r}, expected {FORMAT!r}")
+    if version != FORMAT_VERSION:
+        raise BundleError(
+            f"{path}: format version {version}, this solidgrain reads {FORMAT_VERSION}; export again or update solidgrain"
+        )
+    missing = [key for key in ("name", "octaves", "width", "hidden_layers", "files", "probe") if key not in manifest]
+    if missing or SAMPLER not in manifest["files"]:
+        raise BundleError(f"{path}: incomplete manifest (missing {', '.join(missing) or SAMPLER}); export the bundle again")
+    return dict(manifest)
+
+
+def file_sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def embedded_names() -> list[str]:
+    """The names of the textures that come with the package."""
+    return sorted(folder.name for folder in _embedded_root().iterdir() if (folder / MANIFEST).is_file())
+
+
+def embedded_folder(name: str) -> Path:
+    """The folder of an embedded bundle. Raises BundleError, with close names, when there is none of that name."""
+    names = embedded_names()
+    if name not in names:
+        close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"embedded textures are {', '.join(names)}"
+        raise BundleError(f"{name}: no such texture, bundle folder or texture file; {hint}")
+    return _embedded_root() / name
+
+
+def find_bundle(sampler_sha256: str, near: Path) -> Path | None:
+    """The bundle that a texture file belongs to: the folder that it lies in, or an embedded one."""
+    for folder in (near, *(_embedded_root() / name for name in embedded_names())):
+        path = folder / SAMPLER
+        if (folder / MANIFEST).is_file() and path.is_file() and file_sha256(path) == sampler_sha256:
+            return folder
+    return None
+
+
+def _embedded_root() -> Path:
+    return Path(str(resources.files("solidgrain.runtime"))) / "embedded"

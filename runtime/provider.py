@@ -1,0 +1,57 @@
+"""ONNX Runtime sessions: threads from the processor affinity, and the execution provider that was asked for or an error."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from solidgrain.runtime.errors import BundleError, ProviderError
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+SUFFIX = "ExecutionProvider"
+OPTIONS: dict[str, dict[str, Any]] = {"CUDAExecutionProvider": {"use_tf32": 0}}  # TF32 costs visible precision
+
+
+def available_providers() -> list[str]:
+    """Short names of the providers that this ONNX Runtime can really use, such as "cpu" and "cuda"."""
+    import onnxruntime
+
+    return [name.removesuffix(SUFFIX).lower() for name in onnxruntime.get_available_providers() if name.endswith(SUFFIX)]
+
+
+def usable_threads() -> int:
+    """How many processors this process may use: its affinity mask, not the machine's count."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def open_session(path: Path, provider: str) -> onnxruntime.InferenceSession:
+    """A session on one graph, running on the named provider and on no other.
+
+    One thread per run: the evaluator runs chunks side by side, which needs no synchronisation inside the graph. Raises
+    ProviderError if the provider cannot be had, BundleError if the graph cannot be loaded.
+    """
+    import onnxruntime
+
+    offered = {name.removesuffix(SUFFIX).lower(): name for name in onnxruntime.get_available_providers()}
+    full_name = offered.get(provider.lower())
+    if full_name is None:
+        raise ProviderError(
+            f"provider {provider!r}: not available in onnxruntime {onnxruntime.__version__}, which has {', '.join(offered)}; "
+            "install the matching onnxruntime package (and only one of them)"
+        )
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3  # errors; they arrive as exceptions as well
+    try:
+        session = onnxruntime.InferenceSession(
+            path.read_bytes(), options, providers=[(full_name, OPTIONS.get(full_name, {}))]
+        )
+    except Exception as error:  # ONNX Runtime raises types of its own, without a common base
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise BundleError(f"{path}: ONNX Runtime cannot load the graph ({reason}); export the bundle again") from error
+    if session.get_providers()[0] != full_name:
+        raise ProviderError(f"provider {provider!r}: onnxruntime fell back to {session.get_providers()[0]}; see its log")
+    return session

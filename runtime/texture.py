@@ -1,0 +1,209 @@
+"""Textures: what pipeline scripts hold in their hands. `load` one, then `sample`, `grid` or `slabs`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from solidgrain.runtime import evaluator
+from solidgrain.runtime.bundle import SAMPLER, TEXTURE, Bundle, embedded_folder, find_bundle, open_bundle
+from solidgrain.runtime.errors import BundleError, EvaluationError
+from solidgrain.runtime.lattice import Tiling, tiled, untiled
+from solidgrain.runtime.provider import open_session, usable_threads
+from solidgrain.runtime.texture_file import TextureData, read_texture, write_texture
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+FloatArray = npt.NDArray[np.float32]
+Vector = tuple[float, float, float]
+
+DEFAULT_TEXTURE = "granite"
+SLAB = 16  # slices per slab
+
+
+def load(
+    source: str | os.PathLike[str] = DEFAULT_TEXTURE,
+    *,
+    bundle: str | os.PathLike[str] | None = None,
+    provider: str = "cpu",
+    threads: int = 0,
+) -> Texture:
+    """Load a texture by embedded name, from a bundle folder, or from a saved texture file.
+
+    `bundle` names the bundle of a texture file that neither lies in it nor belongs to an embedded one. `provider` is an
+    ONNX Runtime execution provider by its short name ("cpu", "cuda"); one that cannot be had is an error. `threads` of 0
+    uses every processor that this process may use. Raises BundleError or ProviderError.
+    """
+    data, owner = _resolve(os.fspath(source), None if bundle is None else Path(bundle))
+    return Texture(data, owner, open_session(owner.folder / SAMPLER, provider), threads or usable_threads())
+
+
+def _resolve(source: str, bundle: Path | None) -> tuple[TextureData, Bundle]:
+    path = Path(source)
+    if path.is_dir():
+        owner = open_bundle(path)
+        if not (path / TEXTURE).is_file():
+            raise BundleError(f"{path / TEXTURE}: missing; this bundle holds no texture of its own")
+        return _matching(read_texture(path / TEXTURE), owner)
+    if path.is_file():
+        data = read_texture(path)
+        folder = bundle or find_bundle(data.sampler_sha256, path.parent)
+        if folder is None:
+            wanted = f"{data.sampler_sha256[:12]}… (texture {data.name!r})"
+            raise BundleError(f"{path}: needs the bundle whose sampler.onnx has sha256 {wanted}; name it with bundle= or --bundle")
+        return _matching(data, open_bundle(folder))
+    owner = open_bundle(embedded_folder(source))
+    return _matching(read_texture(owner.folder / TEXTURE), owner)
+
+
+def _matching(data: TextureData, owner: Bundle) -> tuple[TextureData, Bundle]:
+    """The texture and its bundle, if they belong together."""
+    if data.sampler_sha256 != owner.sampler_sha256:
+        raise BundleError(
+            f"{owner.folder}: its sampler.onnx has sha256 {owner.sampler_sha256[:12]}…, "
+            f"texture {data.name!r} needs {data.sampler_sha256[:12]}…; use the bundle that the texture was made with"
+        )
+    octaves, width, layers = (owner.manifest[key] for key in ("octaves", "width", "hidden_layers"))
+    expected = {
+        "transforms": (octaves, 3, 3),
+        "gamma": (layers, width),
+        "delta": (layers, width),
+        "noise_weights": (4, octaves // 4, width),
+    }
+    for name, array in data.arrays().items():
+        if array.shape != expected[name]:
+            raise BundleError(f"{owner.folder}: texture {data.name!r}: {name} has shape {array.shape}, expected {expected[name]}")
+    return data, owner
+
+
+class Texture:
+    """A solid texture: colour at every point of space, in endless instances, one per seed. Made by `load`."""
+
+    def __init__(self, data: TextureData, bundle: Bundle, session: onnxruntime.InferenceSession, threads: int) -> None:
+        self.data, self.bundle, self.threads = data, bundle, threads
+        self._session = session
+
+    @property
+    def name(self) -> str:
+        return self.data.name
+
+    @property
+    def provider(self) -> str:
+        """The ONNX Runtime execution provider that runs it."""
+        return self._session.get_providers()[0]
+
+    @cached_property
+    def transforms(self) -> npt.NDArray[np.float64]:
+        """T_i [n, 3, 3], noise texels per exemplar pixel."""
+        return self.data.transforms
+
+    def sample(self, points: npt.ArrayLike, seed: int = 0) -> FloatArray:
+        """Colour at points [P, 3] (x, y, z) in exemplar pixels -> [P, 3] float32 in [0, 1], sRGB-encoded.
+
+        Raises EvaluationError for points of another shape or that are not finite.
+        """
+        coordinates = np.asarray(points, np.float64)
+        if coordinates.ndim != 2 or coordinates.shape[1] != 3:
+            raise EvaluationError(f"points have shape {coordinates.shape}, expected [P, 3] (x, y, z)")
+        if not np.isfinite(coordinates).all():
+            raise EvaluationError("points hold NaN or infinity, expected finite coordinates")
+        return evaluator.evaluate_points(self._instance(untiled(self.transforms), seed), coordinates, self.threads)
+
+    def grid(
+        self,
+        shape: Sequence[int],
+        seed: int = 0,
+        *,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        spacing: float | Sequence[float] = 1.0,
+        tile: str = "",
+        period: Sequence[int] | None = None,
+    ) -> FloatArray:
+        """Colour on a voxel grid of shape (z, y, x) -> [z, y, x, 3] float32 in [0, 1], sRGB-encoded.
+
+        `origin` (x, y, z) and `spacing` (one number or x, y, z) are in exemplar pixels; voxel k of an axis is at
+        origin + (k + 0.5) spacing. `tile` names the axes that repeat seamlessly, any subset of "xyz", with `period`
+        (z, y, x) in voxels, by default the grid's own shape. Raises EvaluationError for a shape, spacing, period or
+        origin that makes no sense.
+        """
+        volume = np.empty((*_positive("shape", shape), 3), np.float32)
+        for z, slab in self.slabs(shape, seed, origin=origin, spacing=spacing, tile=tile, period=period):
+            volume[z : z + len(slab)] = slab
+        return volume
+
+    def slabs(
+        self,
+        shape: Sequence[int],
+        seed: int = 0,
+        *,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        spacing: float | Sequence[float] = 1.0,
+        tile: str = "",
+        period: Sequence[int] | None = None,
+        slab: int = SLAB,
+    ) -> Iterator[tuple[int, FloatArray]]:
+        """The same grid as runs of whole slices, in order: pairs of first slice and [<= slab, y, x, 3].
+
+        Memory is bounded by the slab, whatever the depth. Arguments and errors as in `grid`.
+        """
+        depth, rows, columns = _positive("shape", shape)
+        (thickness,) = _positive("slab", (slab,), count=1)
+        start, step = _finite("origin", origin), _spacing(spacing)
+        tiling = self.tiling(shape, spacing=spacing, tile=tile, period=period)
+        instance = self._instance(tiling, seed)
+        x, y, z = (
+            tiling.wrap(start[axis] + (np.arange(count) + 0.5) * step[axis], axis)
+            for axis, count in enumerate((columns, rows, depth))
+        )
+        return (
+            (first, evaluator.evaluate_lattice(instance, x, y, z[first : first + thickness], self.threads))
+            for first in range(0, depth, thickness)
+        )
+
+    def tiling(
+        self,
+        shape: Sequence[int],
+        *,
+        spacing: float | Sequence[float] = 1.0,
+        tile: str = "",
+        period: Sequence[int] | None = None,
+    ) -> Tiling:
+        """How tiling moves this texture's transforms for such a grid, and by how much (`distortion`)."""
+        voxels = _positive("period", shape if period is None else period)
+        step = _spacing(spacing)
+        return tiled(self.transforms, (voxels[2] * step[0], voxels[1] * step[1], voxels[0] * step[2]), tile)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Save the texture alone (~25 KB); it loads wherever its bundle can be found."""
+        write_texture(Path(path), self.data)
+
+    def _instance(self, tiling: Tiling, seed: int) -> evaluator.Instance:
+        return evaluator.Instance(self._session, self.data, tiling, seed)
+
+
+def _positive(name: str, values: Sequence[int], count: int = 3) -> tuple[int, ...]:
+    numbers = tuple(values)
+    if len(numbers) != count or any(int(number) != number or number < 1 for number in numbers):
+        raise EvaluationError(f"{name} {numbers}: expected {count} whole number{'s' * (count > 1)} above 0")
+    return tuple(int(number) for number in numbers)
+
+
+def _finite(name: str, values: Sequence[float]) -> Vector:
+    numbers = tuple(float(value) for value in values)
+    if len(numbers) != 3 or not np.isfinite(numbers).all():
+        raise EvaluationError(f"{name} {numbers}: expected three finite numbers (x, y, z)")
+    return (numbers[0], numbers[1], numbers[2])
+
+
+def _spacing(spacing: float | Sequence[float]) -> Vector:
+    step = _finite("spacing", (spacing,) * 3 if isinstance(spacing, (int, float)) else spacing)
+    if min(step) <= 0:
+        raise EvaluationError(f"spacing {step}: expected more than 0 exemplar pixels per voxel")
+    return step
