@@ -8,8 +8,8 @@ Conventions. P points, n octaves in four bins of q = n/4, m hidden units. `T`, `
 The lookup's tensors are [n, P], so that a constant of an octave is a column [n, 1].
 
 Precision. T_i p + o_i is formed in float64, per point, and split into cell and fraction before anything becomes float32:
-the fraction is right at any distance from the origin, whatever the chunk, and no TF32 mode can touch it. Cells are
-integers below 2^24 from there on, exact in float32.
+the fraction is right at any distance from the origin, whatever the chunk, and no TF32 mode can touch it. Texel numbers
+are whole and below 2^24, exact in float32.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from spox import Tensor, Var, argument
 
 OPSET = 17
 RESOLUTION = 64  # texels along each axis of a noise table
+TEXELS = RESOLUTION**3
 SLOPE = 0.2  # of the leaky ReLU (gramgan/models.py)
 
 FloatArray = npt.NDArray[np.float32]
@@ -73,35 +74,65 @@ def _locate(points: Var, transforms: Var, offsets: Var) -> tuple[Triple, Triple]
 
 
 def _look_up(noise: Var, cells: Triple, fractions: Triple, lattice: Var, octaves: int) -> Var:
-    """eta_i(c) of Eq. 1, [n, P]: trilinear between eight texels, each found through the octave's lattice."""
+    """eta_i(c) of Eq. 1, [n, P]: trilinear between eight texels of the octave's table."""
     table = op.reshape(noise, op.const([-1]))
+    own_period = op.const(np.broadcast_to(RESOLUTION * np.eye(3), (octaves, 3, 3)).copy())
+    untiled = op.reduce_min(op.cast(op.equal(lattice, own_period), to=np.float32), keepdims=0)
+    (texels,) = op.if_(
+        op.cast(untiled, to=np.bool_),
+        then_branch=lambda: [op.concat(_table_texels(cells), axis=0)],
+        else_branch=lambda: [op.concat(_lattice_texels(cells, lattice, octaves), axis=0)],
+    )  # [8n, P], in one octave's table
+    starts = op.const(np.tile(np.arange(octaves, dtype=np.int32) * TEXELS, 8)[:, None])
+    index = op.add(op.cast(texels, to=np.int32), starts)
+    # GatherElements: the same read as Gather, five times faster for single numbers in ONNX Runtime on the CPU.
+    values = op.gather_elements(table, op.reshape(index, op.const([-1])))
+    corners = op.reshape(values, op.const([8, octaves, -1]))
+    for fraction in fractions:  # eight along x to four, along y to two, along z to one
+        low, high = op.split(corners, outputs_count=2, axis=0)
+        corners = op.add(low, op.mul(op.sub(high, low), fraction))
+    return op.squeeze(corners, op.const([0]))
+
+
+def _table_texels(cells: Triple) -> list[Var]:
+    """Texels of the eight corners, x slowest, when every octave repeats as its table does: modulo 64 along each axis."""
+    size = op.const(np.float64(RESOLUTION))
+    along = []
+    for axis, stride in enumerate((RESOLUTION**2, RESOLUTION, 1)):
+        low = op.cast(_modulo(cells[axis], size), to=np.float32)
+        high = _modulo(op.add(low, op.const(np.float32(1))), op.const(np.float32(RESOLUTION)))
+        along.append([op.mul(end, op.const(np.float32(stride))) for end in (low, high)])
+    return [op.add(op.add(x, y), z) for x in along[0] for y in along[1] for z in along[2]]
+
+
+def _lattice_texels(cells: Triple, lattice: Var, octaves: int) -> list[Var]:
+    """Texels of the eight corners, x slowest, when each octave repeats on a lattice of its own (tiling).
+
+    A cell's canonical representative (a, b, c) counts in mixed radix: ((a L_yy) + b) L_zz + c enumerates the cells of one
+    period, and that number modulo 64³ is the texel. For 64 Z³ it is the table's own index. (Taking a, b and c modulo 64
+    each would not do: most lattices have pivots 1, 1, |det|, and all but 64 texels would go unused.)
+    """
     entries = op.reshape(lattice, op.const([octaves, 9]))
     basis = [[op.gather(entries, op.const([3 * row + column]), axis=1) for column in range(3)] for row in range(3)]
-    for axis in range(3):
-        cells = _reduce(cells, basis, axis)
-    cells = [op.cast(cell, to=np.float32) for cell in cells]
-    basis = [[op.cast(entry, to=np.float32) for entry in row] for row in basis]
 
-    def interpolate(cell: Triple, axis: int, index: Var) -> Var:
-        """The value between the two neighbours along `axis`, each of them interpolated along the axes that follow."""
-        if axis == 3:
-            found = op.gather_elements(table, op.reshape(op.cast(index, to=np.int32), op.const([-1])))
-            return op.reshape(found, op.const([octaves, -1]))
-        ends = []
-        for neighbour in (cell[axis], op.add(cell[axis], op.const(np.float32(1)))):
+    def corners(cell: Triple, axis: int, count: Var | None) -> list[Var]:
+        if axis == 3 and count is not None:
+            return [op.cast(_modulo(count, op.const(np.float64(TEXELS))), to=np.float32)]
+        found = []
+        for neighbour in (cell[axis], op.add(cell[axis], op.const(np.float64(1)))):
             corner = _reduce([*cell[:axis], neighbour, *cell[axis + 1 :]], basis, axis)
-            texel = _modulo(corner[axis], op.const(np.float32(RESOLUTION)))
-            ends.append(interpolate(corner, axis + 1, op.add(op.mul(index, op.const(np.float32(RESOLUTION))), texel)))
-        return op.add(ends[0], op.mul(op.sub(ends[1], ends[0]), fractions[axis]))
+            counted = corner[axis] if count is None else op.add(op.mul(count, basis[axis][axis]), corner[axis])
+            found += corners(corner, axis + 1, counted)
+        return found
 
-    return interpolate(cells, 0, op.const(np.arange(octaves, dtype=np.float32)[:, None]))
+    return corners(cells, 0, None)
 
 
 def _reduce(cell: Triple, basis: Sequence[Triple], axis: int) -> Triple:
     """One step towards the canonical representative of a cell modulo its octave's lattice.
 
     The basis is lower triangular: column k has its pivot in row k and zeros above, so one floor division per axis, in
-    order, is the whole reduction. Without tiling the basis is 64 times the identity.
+    order, is the whole reduction.
     """
     turns = op.floor(op.div(cell[axis], basis[axis][axis]))
     moved = [op.sub(cell[row], op.mul(turns, basis[row][axis])) for row in range(axis, 3)]

@@ -5,13 +5,14 @@ lands on whole texels: V = round(T diag(period)), T' = V diag(period)^-1. Then l
 that the columns of V generate, instead of modulo 64 Z³: both ends of the tile read the same texels, neighbours included.
 
 A lattice is given by a lower-triangular basis (the Hermite normal form of V): column k has its pivot in row k and zeros
-above, so a cell is reduced by one floor division per axis, in order. Axes that do not tile keep the table's own period,
-64 texels, as their column.
+above, so a cell is reduced by one floor division per axis, in order. The product of the pivots counts the cells of one
+period; the sampler numbers them, and texel (number modulo 64³) of the table is the cell's noise.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,11 +97,11 @@ def _independent(matrices: IntArray) -> npt.NDArray[np.bool_]:
 def lattice_basis(columns: IntArray) -> DoubleArray:
     """A lower-triangular basis [3, 3] of the lattice that the columns [3, k] generate.
 
-    Column-style Hermite normal form by Euclid's algorithm, in Python integers. Rows without a pivot, when k < 3, get the
-    table's own period.
+    Column-style Hermite normal form by Euclid's algorithm, in Python integers. Rows without a pivot, when k < 3, get a
+    period of their own, as long as the table has texels for, and 64 at least.
     """
     left = [[int(entry) for entry in column] for column in columns.T]
-    basis = RESOLUTION * np.eye(3)
+    basis = np.zeros((3, 3))
     for row in range(3):
         while len(pivots := [column for column in left if column[row]]) > 1:
             smallest = min(pivots, key=lambda column: abs(column[row]))
@@ -112,4 +113,9 @@ def lattice_basis(columns: IntArray) -> DoubleArray:
             pivot = pivots[0]
             left = [column for column in left if column is not pivot]
             basis[:, row] = np.array(pivot) * (1 if pivot[row] > 0 else -1)
+    free = [row for row in range(3) if basis[row, row] == 0]
+    if free:
+        cells = math.prod(basis[row, row] for row in range(3) if row not in free)
+        length = max(RESOLUTION, int((RESOLUTION**3 / cells) ** (1 / len(free))))
+        basis[free, free] = length
     return basis

@@ -1,0 +1,60 @@
+"""Running a plan: slabs are evaluated in order and handed to every writer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from solidgrain.bake.plan import Plan
+from solidgrain.bake.writers import Writer, open_writer
+from solidgrain.runtime import Texture
+from solidgrain.runtime.errors import BakeError
+
+OnSlice = Callable[[int, int], None]  # slices done, slices in all
+
+
+@dataclass(frozen=True)
+class Baked:
+    """What a bake left behind."""
+
+    files: list[Path]
+    seconds: float
+    evaluation_seconds: float  # of them, in the sampler
+
+
+def bake(plan: Plan, texture: Texture, on_slice: OnSlice = lambda done, total: None) -> Baked:
+    """Evaluate a plan and write its outputs, all of them or none.
+
+    Raises BakeError if a file cannot be written, EvaluationError if the texture returns NaN; then, as after an interrupt,
+    nothing is left behind.
+    """
+    writers: list[Writer] = []
+    started = time.monotonic()
+    try:
+        for output in plan.outputs:
+            writers.append(open_writer(output, plan.volume))
+        evaluation = _feed(plan, texture, writers, on_slice)
+        files = [path for writer in writers for path in writer.commit()]
+    except OSError as error:
+        raise BakeError(f"cannot write {error.filename or 'the outputs'}: {error.strerror}; free space or bake elsewhere") from error
+    finally:
+        for writer in writers:
+            writer.abort()  # nothing to do for those that have committed
+    return Baked(files, time.monotonic() - started, evaluation)
+
+
+def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], on_slice: OnSlice) -> float:
+    """All slabs to all writers. Returns the seconds spent in the sampler."""
+    volume, evaluation, waiting_since = plan.volume, 0.0, time.monotonic()
+    slabs = texture.slabs(
+        volume.shape, plan.seed, origin=plan.origin, spacing=plan.spacing, tile=plan.tile, slab=plan.slab
+    )
+    for z, slab in slabs:
+        evaluation += time.monotonic() - waiting_since
+        for writer in writers:
+            writer.write(z, slab)
+        on_slice(z + len(slab), volume.shape[0])
+        waiting_since = time.monotonic()
+    return evaluation

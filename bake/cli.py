@@ -1,0 +1,94 @@
+"""The command line. Subcommands are imported when they are called: `solidgrain --help` needs neither torch nor VTK.
+
+Exit codes: 0 done, 1 failed, 2 usage, 3 verification failed, 130 interrupted. stdout carries data only; progress, logs and
+errors go to stderr, an error as one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import signal
+import sys
+from collections.abc import Sequence
+from types import FrameType, ModuleType
+from typing import NoReturn
+
+from solidgrain.runtime.errors import SolidgrainError
+
+COMMANDS = {
+    "bake": ("solidgrain.bake.commands.bake", "evaluate a texture on a voxel grid and write it to files"),
+    "view": ("solidgrain.bake.commands.view", "look at a volume with pyvista, on screen or to a PNG"),
+    "info": ("solidgrain.bake.commands.info", "say what a texture or bundle is, and check it"),
+    "doctor": ("solidgrain.bake.commands.doctor", "say what this installation can do, and what is wrong with it"),
+    "train": ("solidgrain.train.command", "learn a solid texture from one photograph"),
+    "export": ("solidgrain.export.command", "turn a training run into a bundle of ONNX graphs"),
+    "evaluate": ("solidgrain.bake.commands.evaluate", "measure a texture's slices against its exemplar"),
+}
+EXTRAS = {
+    "torch": "train",
+    "onnx": "export",
+    "spox": "export",
+    "OpenEXR": "bake",
+    "OpenImageIO": "bake",
+    "pyvista": "view",
+    "vtkmodules": "view",
+}
+DONE, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line instead of a page of usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(USAGE, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command line. Returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    parser, module = _parser(arguments)
+    options = parser.parse_args(arguments)
+    if module is None:
+        parser.print_help()
+        return USAGE
+    signal.signal(signal.SIGTERM, _interrupt)  # farms stop jobs with SIGTERM: clean up as for Ctrl-C
+    try:
+        return int(module.run(options))
+    except SolidgrainError as error:
+        return _fail(str(error))
+    except ModuleNotFoundError as error:
+        package = (error.name or "").split(".")[0]
+        if package not in EXTRAS:
+            raise
+        return _fail(f"{options.command} needs the package {package}; pip install 'solidgrain[{EXTRAS[package]}]'")
+    except KeyboardInterrupt:
+        print("interrupted; nothing half-written was left behind", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _parser(arguments: Sequence[str]) -> tuple[Parser, ModuleType | None]:
+    """The parser, with the arguments of the one command that is called, and that command's module."""
+    parser = Parser(prog="solidgrain", description="Solid textures from one photograph: train, export, bake, view.")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    called = next((word for word in arguments if not word.startswith("-")), None)
+    module = None
+    for name, (module_name, summary) in COMMANDS.items():
+        command = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
+        if name == called:
+            module = importlib.import_module(module_name)
+            module.add_arguments(command)
+    return parser, module
+
+
+def _fail(message: str) -> int:
+    print(f"solidgrain: {message}", file=sys.stderr)
+    return FAILED
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""What a writer is: it takes slabs in order and leaves a complete file behind, or none."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from solidgrain.runtime.errors import BakeError
+
+FloatArray = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Volume:
+    """The grid that is being written, and where its colours come from."""
+
+    shape: tuple[int, int, int]  # voxels (z, y, x)
+    origin: tuple[float, float, float]  # (x, y, z), exemplar pixels
+    spacing: tuple[float, float, float]  # (x, y, z), exemplar pixels per voxel
+    texture: str
+    sampler_sha256: str
+    seed: int
+    tile: str
+
+    @property
+    def voxels(self) -> int:
+        return self.shape[0] * self.shape[1] * self.shape[2]
+
+    @property
+    def first_sample(self) -> tuple[float, float, float]:
+        """Where voxel (0, 0, 0) is sampled (x, y, z): at its centre."""
+        x, y, z = (start + 0.5 * step for start, step in zip(self.origin, self.spacing, strict=True))
+        return (x, y, z)
+
+
+@dataclass(frozen=True)
+class Output:
+    """One file, or one numbered stack of files, to write."""
+
+    path: Path  # may hold a frame pattern
+    kind: str  # suffix in the table, or "preview"
+    options: dict[str, str | int] = field(default_factory=dict)
+
+
+class Writer(ABC):
+    """Takes the slabs of a volume in order. Nothing is visible under its final name before `commit`."""
+
+    def __init__(self, output: Output, volume: Volume) -> None:
+        self.output, self.volume = output, volume
+
+    @abstractmethod
+    def write(self, z: int, slab: FloatArray) -> None:
+        """One slab: slices z, z + 1, ..., [<= slab, y, x, 3] in [0, 1], sRGB-encoded."""
+
+    @abstractmethod
+    def commit(self) -> Sequence[Path]:
+        """Put the finished files in place and name them."""
+
+    @abstractmethod
+    def abort(self) -> None:
+        """Remove whatever has been written so far. Safe to call at any time, more than once."""
+
+
+class FileWriter(Writer):
+    """A writer of a single file, under a temporary name in the same folder until it is whole."""
+
+    def __init__(self, output: Output, volume: Volume) -> None:
+        super().__init__(output, volume)
+        self.temporary = temporary_name(output.path)
+        self.file: BinaryIO = open(self.temporary, "wb")
+
+    def commit(self) -> Sequence[Path]:
+        self.file.flush()
+        os.fsync(self.file.fileno())
+        self.file.close()
+        os.replace(self.temporary, self.output.path)
+        return [self.output.path]
+
+    def abort(self) -> None:
+        self.file.close()
+        self.temporary.unlink(missing_ok=True)
+
+
+def temporary_name(path: Path) -> Path:
+    """A hidden name beside the file, this process's own."""
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+def to_uint8(rgb: FloatArray) -> npt.NDArray[np.uint8]:
+    """[0, 1] to 0 .. 255, to the nearest."""
+    scaled: npt.NDArray[np.uint8] = (rgb.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+    return scaled
+
+
+def check_no_options(output: Output) -> None:
+    if output.options:
+        raise BakeError(f"{output.path}: {', '.join(output.options)} does not apply to {output.kind}")

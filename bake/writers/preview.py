@@ -1,0 +1,124 @@
+"""The preview: a PNG with the three middle slices and the block itself, turned, as one looks at it from above.
+
+Left to right: z, y and x middle slice (the second and third with z upwards), then the block with its faces x = last, y = 0 and
+z = last. Only those six planes are kept while the volume streams by, thinned to 512 samples an axis.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer, temporary_name, to_uint8
+from solidgrain.runtime.errors import BakeError
+
+PANEL = 384  # pixels along each side of a panel
+GAP = 12
+FINEST = 512  # samples of a plane along an axis
+SAMPLES = 3  # of the block per pixel, along each axis
+VIEW = np.array([1.0, -1.35, 0.95])  # from the block towards the eye
+SHADE = {0: 0.86, 1: 0.68, 2: 1.0}  # brightness of the faces across x, y and z
+BACKGROUND = 0.12
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One plane of the volume: the voxel index it lies at, along one axis (0 x, 1 y, 2 z)."""
+
+    axis: int
+    index: int
+
+
+class PreviewFile(Writer):
+    """Collects six planes, draws when the last slab has come."""
+
+    def __init__(self, output: Output, volume: Volume) -> None:
+        super().__init__(output, volume)
+        extents = volume.shape[::-1]
+        self.steps = [-(-extent // FINEST) for extent in extents]
+        middles = [Plane(axis, extents[axis] // 2) for axis in (2, 1, 0)]
+        faces = [Plane(0, extents[0] - 1), Plane(1, 0), Plane(2, extents[2] - 1)]
+        self.middles, self.faces = middles, faces
+        self.parts: dict[Plane, list[FloatArray]] = {plane: [] for plane in [*middles, *faces]}
+        self.temporary = temporary_name(output.path).with_suffix(".png")
+
+    def write(self, z: int, slab: FloatArray) -> None:
+        thin_x, thin_y, thin_z = self.steps
+        levels = [level for level in range(z, z + len(slab)) if level % thin_z == 0]
+        thinned = slab[[level - z for level in levels]]
+        for plane, parts in self.parts.items():
+            if plane.axis == 2 and z <= plane.index < z + len(slab):
+                parts.append(slab[plane.index - z, ::thin_y, ::thin_x].copy())  # [y, x]
+            elif plane.axis == 1:
+                parts.append(thinned[:, plane.index, ::thin_x].copy())  # [z, x]
+            elif plane.axis == 0:
+                parts.append(thinned[:, ::thin_y, plane.index].copy())  # [z, y]
+
+    def commit(self) -> Sequence[Path]:
+        import OpenImageIO as oiio
+
+        planes = {plane: np.concatenate(parts) for plane, parts in self.parts.items()}
+        slices = [planes[plane] if plane.axis == 2 else planes[plane][::-1] for plane in self.middles]
+        block = draw_block([planes[plane] for plane in self.faces], self.volume.shape[::-1])
+        gap = np.full((PANEL, GAP, 3), BACKGROUND, np.float32)
+        panels = [part for picture in [*map(fit, slices), block] for part in (picture, gap)][:-1]
+        picture = to_uint8(np.concatenate(panels, axis=1))
+        image = oiio.ImageBuf(np.ascontiguousarray(picture))
+        image.specmod().attribute("oiio:ColorSpace", "srgb_rec709_scene")
+        image.specmod().attribute("Software", "solidgrain")
+        image.specmod().attribute("DateTime", "")
+        if not image.write(os.fspath(self.temporary)):
+            raise BakeError(f"{self.output.path}: cannot write the preview ({image.geterror()})")
+        os.replace(self.temporary, self.output.path)
+        return [self.output.path]
+
+    def abort(self) -> None:
+        self.temporary.unlink(missing_ok=True)
+
+
+def fit(plane: FloatArray) -> FloatArray:
+    """A plane scaled into a panel, nearest sample, its proportions kept, centred."""
+    height, width = plane.shape[:2]
+    scale = PANEL / max(height, width)
+    rows, columns = (np.arange(max(1, round(extent * scale))) for extent in (height, width))
+    scaled = plane[np.minimum((rows / scale).astype(int), height - 1)][:, np.minimum((columns / scale).astype(int), width - 1)]
+    panel = np.full((PANEL, PANEL, 3), BACKGROUND, np.float32)
+    top, left = (PANEL - len(rows)) // 2, (PANEL - len(columns)) // 2
+    panel[top : top + len(rows), left : left + len(columns)] = scaled
+    return panel
+
+
+def draw_block(faces: Sequence[FloatArray], extents: Sequence[int]) -> FloatArray:
+    """The block in parallel projection, z up, its three visible faces sampled from `faces` (x = last, y = 0, z = last)."""
+    half = np.array(extents, float) / (2 * max(extents))
+    toward = VIEW / np.linalg.norm(VIEW)
+    right = np.cross([0, 0, 1], toward)
+    right /= np.linalg.norm(right)
+    up = np.cross(toward, right)
+    ticks = ((np.arange(PANEL * SAMPLES) + 0.5) / (PANEL * SAMPLES) - 0.5) * 1.75  # the unit cube's diagonal, and a little
+    across, above = np.meshgrid(ticks, -ticks)
+    start = across[..., None] * right + above[..., None] * up + 2 * toward
+    enter = (np.sign(toward) * half - start) / -toward  # distance along the ray at which it enters each pair of planes
+    leave = (-np.sign(toward) * half - start) / -toward
+    near, far, entered = enter.max(-1), leave.min(-1), enter.argmax(-1)
+    position = (start - near[..., None] * toward) / (2 * half) + 0.5  # 0 .. 1 along each axis
+    picture = np.full((*near.shape, 3), BACKGROUND, np.float32)
+    for axis, face in enumerate(faces):
+        seen = (near < far) & (entered == axis)
+        column_axis, row_axis = [other for other in (0, 1, 2) if other != axis]
+        rows, columns = (_index(position[seen][:, k], count) for k, count in zip((row_axis, column_axis), face.shape, strict=False))
+        picture[seen] = face[rows, columns] * SHADE[axis]
+    return picture.reshape(PANEL, SAMPLES, PANEL, SAMPLES, 3).mean((1, 3), dtype=np.float32)
+
+
+def _index(position: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.int64]:
+    return np.clip((position * count).astype(np.int64), 0, count - 1)
+
+
+def size(output: Output, volume: Volume) -> int:
+    return 4 * PANEL * (PANEL + GAP) * 3 + 65536
