@@ -1,0 +1,112 @@
+"""`solidgrain doctor`: what this installation can do. Exit code 1 if something is wrong with it."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, distributions, version
+from typing import Any
+
+PACKAGES = ("solidgrain", "numpy", "onnxruntime", "OpenEXR", "OpenImageIO", "pyvista", "vtk", "torch", "onnx", "spox")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    report = diagnose()
+    print(json.dumps(report, indent=2) if arguments.json else summary(report))
+    return 1 if report["problems"] else 0
+
+
+def diagnose() -> dict[str, Any]:
+    """Everything that the doctor looks at, as plain data; `problems` is empty on a healthy installation."""
+    from solidgrain.runtime.provider import usable_threads
+
+    problems: list[str] = []
+    return {
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "packages": {name: _version(name) for name in PACKAGES},
+        "threads": {"usable": usable_threads(), "processors": os.cpu_count()},
+        "onnxruntime_builds": _onnxruntime_builds(problems),
+        "providers": _providers(problems),
+        "textures": _textures(problems),
+        "opengl": _opengl(),
+        "problems": problems,
+    }
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _onnxruntime_builds(problems: list[str]) -> list[str]:
+    """Installed builds of ONNX Runtime. Two of them overwrite each other's files, and the CPU build usually wins."""
+    names = (str(found.metadata["Name"]) for found in distributions())
+    builds = sorted({name for name in names if name.lower().startswith("onnxruntime")})
+    if len(builds) > 1:
+        problems.append(f"{' and '.join(builds)} are installed together; uninstall all of them, then install one")
+    return builds
+
+
+def _providers(problems: list[str]) -> dict[str, str]:
+    """What happens when the embedded texture is really loaded on each provider that ONNX Runtime offers."""
+    from solidgrain.runtime import SolidgrainError, load
+    from solidgrain.runtime.provider import available_providers
+
+    found = {}
+    for provider in available_providers():
+        try:
+            load(provider=provider).sample([[0.5, 0.5, 0.5]])
+            found[provider] = "works"
+        except SolidgrainError as error:
+            found[provider] = str(error)
+        except Exception as error:  # a provider's own failure, whatever its type, is what is being reported
+            found[provider] = str(error).strip().splitlines()[0]
+    if found.get("cpu") != "works":
+        problems.append(f"the CPU provider does not work: {found.get('cpu', 'not offered')}")
+    return found
+
+
+def _textures(problems: list[str]) -> dict[str, float]:
+    """The embedded textures, with their largest difference from the colours in their manifests."""
+    from solidgrain.bake.commands.info import TOLERANCE, probe_error
+    from solidgrain.runtime import embedded_names, load
+
+    errors = {name: probe_error(load(name)) for name in embedded_names()}
+    problems += [f"{name}: colours differ from the manifest by {error:.1g}" for name, error in errors.items() if error > TOLERANCE]
+    return errors
+
+
+def _opengl() -> str:
+    from solidgrain.bake.opengl import REMEDY, opengl_error
+
+    if importlib.util.find_spec("pyvista") is None:
+        return "not needed: pyvista is not installed (pip install 'solidgrain[view]')"
+    reason = opengl_error()
+    return "works" if reason is None else f"{reason}; {REMEDY}"
+
+
+def summary(report: dict[str, Any]) -> str:
+    """The report for people."""
+    threads = report["threads"]
+    packages = ", ".join(f"{name} {found or '-'}" for name, found in report["packages"].items())
+    lines = [
+        f"python     {report['python']} on {report['machine']}",
+        f"packages   {packages}",
+        f"threads    {threads['usable']} usable of {threads['processors']} processors",
+        f"runtime    {', '.join(report['onnxruntime_builds'])}",
+        *(f"provider   {name}: {state}" for name, state in report["providers"].items()),
+        *(f"texture    {name}: largest difference from its manifest {error:.1g}" for name, error in report["textures"].items()),
+        f"OpenGL     {report['opengl']}",
+        *(f"PROBLEM    {problem}" for problem in report["problems"]),
+    ]
+    return "\n".join(lines)

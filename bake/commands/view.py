@@ -1,0 +1,22 @@
+"""`solidgrain view`: a volume on screen, or on a PNG."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+MODES = ("slices", "volume", "threshold", "block")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("file", type=Path, metavar="FILE", help="a .vti or .npy volume")
+    add("--mode", choices=MODES, default="slices", help="what to show (slices)")
+    add("--screenshot", type=Path, metavar="OUT.png", help="draw off screen instead of opening a window")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from solidgrain.bake.view import show
+
+    show(arguments.file, arguments.mode, arguments.screenshot)
+    return 0

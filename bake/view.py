@@ -1,0 +1,125 @@
+"""Looking at volumes with pyvista: orthogonal slices, the volume itself, a threshold, or its outer faces."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from solidgrain.bake.opengl import has_display, off_screen_environment, require_opengl
+from solidgrain.runtime.errors import ViewError
+
+if TYPE_CHECKING:
+    import pyvista
+
+
+def read_volume(path: Path) -> pyvista.ImageData:
+    """A volume with RGB point data `rgb` (uint8), from `.vti` (or what else pyvista reads) or `.npy` [z, y, x, 3] in [0, 1].
+
+    Raises ViewError if the file is missing, unreadable or holds no colours.
+    """
+    import pyvista
+
+    if not path.is_file():
+        raise ViewError(f"{path}: no such file; expected a volume made by solidgrain bake (.vti or .npy)")
+    if path.suffix.lower() == ".npy":
+        return _from_array(path)
+    try:
+        image = pyvista.read(os.fspath(path))
+    except Exception as error:  # VTK's readers raise several unrelated types
+        raise ViewError(f"{path}: not readable as a volume ({str(error).splitlines()[0]})") from error
+    if not isinstance(image, pyvista.ImageData) or "rgb" not in image.point_data or image.point_data["rgb"].ndim != 2:
+        raise ViewError(f"{path}: expected image data with a point array 'rgb', found {_contents(image)}")
+    image.point_data["rgb"] = _bytes(np.asarray(image.point_data["rgb"]))
+    return image
+
+
+def _contents(image: Any) -> str:
+    names = list(getattr(image, "point_data", {}).keys())
+    return f"{type(image).__name__} with {', '.join(names) or 'no point arrays'}"
+
+
+def _from_array(path: Path) -> pyvista.ImageData:
+    import pyvista
+
+    try:
+        array = np.load(path, allow_pickle=False, mmap_mode="r")
+    except (OSError, ValueError) as error:
+        raise ViewError(f"{path}: not readable as an array ({error})") from error
+    if array.ndim != 4 or array.shape[-1] != 3:
+        raise ViewError(f"{path}: shape {array.shape}, expected [z, y, x, 3]")
+    image = pyvista.ImageData(dimensions=array.shape[2::-1], origin=(0.5, 0.5, 0.5))
+    image.point_data["rgb"] = _bytes(array.reshape(-1, 3))
+    return image
+
+
+def _bytes(colors: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    if colors.dtype == np.uint8:
+        return colors
+    scaled: npt.NDArray[np.uint8] = (np.clip(colors, 0, 1) * 255 + 0.5).astype(np.uint8)
+    return scaled
+
+
+def show(path: Path, mode: str = "slices", screenshot: Path | None = None, size: tuple[int, int] = (1024, 768)) -> None:
+    """Show a volume in a window, or draw it off screen into a PNG.
+
+    Raises ViewError where there is no OpenGL library, and for a window where there is no display.
+    """
+    if screenshot is None and not has_display():
+        raise ViewError("no display to open a window on; use --screenshot FILE.png")
+    if screenshot is not None and (screenshot.suffix.lower() != ".png" or not screenshot.parent.is_dir()):
+        raise ViewError(f"--screenshot {screenshot}: expected a name that ends in .png in a folder that exists")
+    image = read_volume(path)
+    require_opengl()
+    off_screen_environment()
+    import pyvista
+
+    plotter = pyvista.Plotter(off_screen=screenshot is not None, window_size=list(size))
+    plotter.set_background("#1f1f1f")
+    _add(plotter, image, mode, interactive=screenshot is None)
+    plotter.add_axes()
+    plotter.camera_position = "iso"
+    if screenshot is None:
+        plotter.show(title=f"solidgrain: {path.name}")
+        return
+    temporary = screenshot.with_name(f".{screenshot.stem}.{os.getpid()}.tmp.png")
+    try:
+        plotter.screenshot(os.fspath(temporary))
+        os.replace(temporary, screenshot)
+    except OSError as error:
+        raise ViewError(f"--screenshot {screenshot}: cannot write ({error.strerror})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+        plotter.close()
+
+
+def _add(plotter: pyvista.Plotter, image: pyvista.ImageData, mode: str, interactive: bool) -> None:
+    """Put the volume on the stage. In a window, slices and threshold have widgets to move them."""
+    if mode == "slices":
+        if interactive:
+            plotter.add_mesh_slice_orthogonal(image, scalars="rgb", rgb=True)
+        else:
+            plotter.add_mesh(image.slice_orthogonal(), scalars="rgb", rgb=True, lighting=False)
+    elif mode == "volume":
+        rgba = np.column_stack([image.point_data["rgb"], luma(image)])  # VTK takes the opacity from the fourth component
+        image.point_data["rgba"] = rgba
+        plotter.add_volume(image, scalars="rgba", opacity_unit_distance=4 * max(image.spacing))
+    elif mode == "threshold":
+        image.point_data["luma"] = luma(image)
+        if interactive:
+            plotter.add_mesh_threshold(image, scalars="luma", show_scalar_bar=False)
+        else:
+            bright = image.threshold(float(np.median(image.point_data["luma"])), scalars="luma", all_scalars=True)
+            plotter.add_mesh(bright, scalars="rgb", rgb=True)
+    else:
+        plotter.add_mesh(image.extract_surface(algorithm="dataset_surface"), scalars="rgb", rgb=True)
+
+
+def luma(image: pyvista.ImageData) -> npt.NDArray[np.uint8]:
+    """Rec.709 luma of the colours."""
+    weights = np.array([0.2126, 0.7152, 0.0722], np.float32)
+    values: npt.NDArray[np.uint8] = (np.asarray(image.point_data["rgb"]) @ weights).astype(np.uint8)
+    return values
