@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from types import FrameType, ModuleType
 from typing import NoReturn
 
-from solidgrain.runtime.errors import SolidgrainError
-
 COMMANDS = {
     "bake": ("solidgrain.bake.commands.bake", "evaluate a texture on a voxel grid and write it to files"),
     "view": ("solidgrain.bake.commands.view", "look at a volume with pyvista, on screen or to a PNG"),
@@ -52,6 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if module is None:
         parser.print_help()
         return USAGE
+    from solidgrain.runtime.errors import SolidgrainError  # here: it imports numpy, which --help can do without
+
     signal.signal(signal.SIGTERM, _interrupt)  # farms stop jobs with SIGTERM: clean up as for Ctrl-C
     try:
         return int(module.run(options))

@@ -65,7 +65,7 @@ def write_texture(path: Path, texture: TextureData) -> None:
 def read_texture(path: Path) -> TextureData:
     """Read a texture file. Raises BundleError if it is damaged, of another version, or holds values that are not finite."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             header = json.loads(str(archive["header"]))
             arrays = {name: archive[name] for name in ARRAYS}
     except OSError as error:

@@ -80,13 +80,17 @@ def _encode(rgb: FloatArray, color_space: str) -> FloatArray:
 
 
 def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:
-    """Random crops of the exemplar [3, H, W], each flipped left-right and up-down by chance: [B, 3, patch, patch]."""
-    size = settings.patch
+    """Random crops of the exemplar [3, H, W], each flipped left-right and up-down by chance: [B, 3, patch, patch].
+
+    An isotropic material looks the same turned by 90°, so its crops are also transposed by chance.
+    """
+    size, transposed = settings.patch, settings.transposed and settings.grain == "none"
     patches = []
     for _ in range(settings.batch):
         top, left = (_below(extent - size + 1, generator) for extent in exemplar.shape[1:])
         crop = exemplar[:, top : top + size, left : left + size]
-        patches.append(crop.flip([axis for axis in (1, 2) if _below(2, generator)]))
+        crop = crop.flip([axis for axis in (1, 2) if _below(2, generator)])
+        patches.append(crop.transpose(1, 2) if transposed and _below(2, generator) else crop)
     return torch.stack(patches).contiguous(memory_format=torch.channels_last)
 
 

@@ -30,6 +30,7 @@ class Settings:
     # Slices (Sec. 4, implementation details)
     patch: int = 64  # pixels along each side of a patch
     batch: int = 4
+    transposed: bool = True  # real patches of isotropic materials are also transposed by chance, not only flipped
     rotations: Literal["uniform", "euler"] = "uniform"  # uniform on SO(3), or the authors' three angles in [0°, 90°]
     grain: Literal["none", "x", "y"] = "none"  # the image axis about which slices turn; "none" turns them freely
     grain_ratio: float = 1.0  # length of the structures across the grain over along it, at the start
@@ -68,6 +69,7 @@ PAPER = Settings(
     noise_weight_start=1.0,
     patch=128,
     batch=16,
+    transposed=False,
     rotations="euler",
     penalty_every=1,
     pooled_gram=False,

@@ -1,0 +1,148 @@
+"""Loading checks everything, and says which file is wrong."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from solidgrain.export.bundle import Details, write_bundle
+from solidgrain.runtime import BundleError, EvaluationError, ProviderError, embedded_names, load
+from solidgrain.runtime.texture_file import TextureData, read_texture, write_texture
+from tests.toy import toy_weights
+
+
+@pytest.fixture
+def broken(toy_folder, tmp_path):
+    """A copy of the toy bundle, for breaking."""
+    return shutil.copytree(toy_folder, tmp_path / "broken")
+
+
+def edit_manifest(folder, **changes):
+    path = folder / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def test_granite_is_embedded_and_the_default():
+    assert "granite" in embedded_names()
+    assert load().name == "granite"
+
+
+def test_an_unknown_name_suggests_close_ones():
+    with pytest.raises(BundleError, match="did you mean granite"):
+        load("granit")
+
+
+def test_a_saved_texture_finds_its_bundle_and_looks_the_same(tmp_path, toy, toy_folder):
+    toy.save(tmp_path / "mine.sgt.npz")
+    with pytest.raises(BundleError, match="needs the bundle"):
+        load(tmp_path / "mine.sgt.npz")
+    again = load(tmp_path / "mine.sgt.npz", bundle=toy_folder)
+    assert np.array_equal(again.grid((1, 8, 8)), toy.grid((1, 8, 8)))
+    load("granite").save(tmp_path / "granite.sgt.npz")
+    assert load(tmp_path / "granite.sgt.npz").name == "granite"
+
+
+def test_equal_textures_are_equal_files_of_at_most_30_kilobytes(tmp_path):
+    for name in ("a.sgt.npz", "b.sgt.npz"):
+        load("granite").save(tmp_path / name)
+    assert (tmp_path / "a.sgt.npz").read_bytes() == (tmp_path / "b.sgt.npz").read_bytes()
+    assert (tmp_path / "a.sgt.npz").stat().st_size < 30_000
+
+
+def test_a_texture_of_another_bundle_is_refused_with_the_sha256_that_it_needs(tmp_path, toy):
+    toy.save(tmp_path / "mine.sgt.npz")
+    with pytest.raises(BundleError, match=toy.data.sampler_sha256[:12]):
+        load(tmp_path / "mine.sgt.npz", bundle=load("granite").bundle.folder)
+
+
+@pytest.mark.parametrize("name", ["sampler.onnx", "texture.sgt.npz"])
+def test_a_missing_file_is_named(broken, name):
+    (broken / name).unlink()
+    with pytest.raises(BundleError, match=f"{name}: missing"):
+        load(broken)
+
+
+def test_a_missing_manifest_is_named(broken):
+    (broken / "manifest.json").unlink()
+    with pytest.raises(BundleError, match="no manifest.json"):
+        load(broken)
+
+
+@pytest.mark.parametrize("name", ["sampler.onnx", "texture.sgt.npz"])
+def test_a_corrupted_file_is_named(broken, name):
+    data = bytearray((broken / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (broken / name).write_bytes(data)
+    with pytest.raises(BundleError, match=f"{name}: sha256"):
+        load(broken)
+
+
+def test_a_swapped_graph_is_noticed(broken, tmp_path):
+    other = write_bundle(tmp_path / "other", toy_weights(seed=6), Details(name="other", patch=64))
+    shutil.copy(other / "sampler.onnx", broken / "sampler.onnx")
+    with pytest.raises(BundleError, match="belongs to another bundle"):
+        load(broken)
+
+
+def test_a_graph_that_onnx_runtime_cannot_load_is_named(broken):
+    from solidgrain.runtime.bundle import file_sha256
+
+    (broken / "sampler.onnx").write_bytes(b"not a graph")
+    digest = file_sha256(broken / "sampler.onnx")
+    edit_manifest(broken, files={"sampler.onnx": digest, "texture.sgt.npz": file_sha256(broken / "texture.sgt.npz")})
+    data = read_texture(broken / "texture.sgt.npz")
+    write_texture(broken / "texture.sgt.npz", TextureData(data.name, digest, **data.arrays()))
+    edit_manifest(broken, files={"sampler.onnx": digest, "texture.sgt.npz": file_sha256(broken / "texture.sgt.npz")})
+    with pytest.raises(BundleError, match="ONNX Runtime cannot load"):
+        load(broken)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"format_version": 99}, "version 99"), ({"format": "zip"}, "format is 'zip'"), ({"files": {}}, "incomplete")],
+)
+def test_another_format_or_version_is_refused(broken, changes, message):
+    edit_manifest(broken, **changes)
+    with pytest.raises(BundleError, match=message):
+        load(broken)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 1}'])
+def test_a_manifest_that_is_no_manifest_is_refused(broken, text):
+    (broken / "manifest.json").write_text(text)
+    with pytest.raises(BundleError, match=r"manifest\.json"):
+        load(broken)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"hello"])
+def test_a_damaged_texture_file_is_refused(tmp_path, content):
+    path = tmp_path / "bad.sgt.npz"
+    path.write_bytes(content)
+    with pytest.raises(BundleError, match=r"bad\.sgt\.npz"):
+        load(path)
+
+
+def test_nan_in_a_texture_file_is_refused(tmp_path, toy, toy_folder):
+    arrays = toy.data.arrays()
+    arrays["gamma"] = np.full_like(arrays["gamma"], np.nan)
+    write_texture(tmp_path / "nan.sgt.npz", TextureData("toy", toy.data.sampler_sha256, **arrays))
+    with pytest.raises(BundleError, match="gamma is not finite"):
+        load(tmp_path / "nan.sgt.npz", bundle=toy_folder)
+
+
+def test_a_model_that_returns_nan_is_an_error(tmp_path):
+    weights = toy_weights()
+    weights.weights[2][0, 0] = np.nan
+    folder = write_bundle(tmp_path / "nan", weights, Details(name="nan", patch=64))
+    with pytest.raises(EvaluationError, match="returned NaN"):
+        load(folder).grid((1, 4, 4))
+
+
+def test_a_provider_that_cannot_be_had_is_an_error_that_lists_the_others():
+    with pytest.raises(ProviderError, match=r"'rocket'.*cpu"):
+        load(provider="rocket")
+
+
+def test_the_provider_that_runs_is_named(toy):
+    assert toy.provider == "CPUExecutionProvider"

@@ -1,0 +1,139 @@
+"""The colour of a voxel depends on texture, seed and coordinate, and on nothing else."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from solidgrain.runtime import EvaluationError, load
+from solidgrain.runtime.evaluator import CPU_CHUNK
+from solidgrain.runtime.noise import noise_tables
+from tests.reference import color
+from tests.toy import toy_weights
+
+AXES = ["".join(axes) for count in (1, 2, 3) for axes in itertools.combinations("xyz", count)]
+
+
+@pytest.mark.parametrize("reach", [64.0, 1e4, 1e9])
+def test_sampler_is_the_formula_near_and_far(toy, reach):
+    points = np.random.default_rng(0).uniform(-reach, reach, (20, 3))
+    tables = noise_tables(3, 16)
+    expected = [color(toy_weights(), tables, tuple(point)) for point in points]
+    np.testing.assert_allclose(toy.sample(points, seed=3), expected, atol=1e-4)
+
+
+def test_a_grid_is_sampled_at_voxel_centres_x_fastest(toy):
+    volume = toy.grid((2, 3, 4), seed=1, origin=(10, 20, 30), spacing=(0.5, 1.0, 2.0))
+    z, y, x = 1, 2, 3
+    point = [10 + (x + 0.5) * 0.5, 20 + (y + 0.5) * 1.0, 30 + (z + 0.5) * 2.0]
+    assert np.array_equal(volume[z, y, x], toy.sample([point], seed=1)[0])
+
+
+def test_slabs_of_any_thickness_make_the_same_grid(toy):
+    whole = toy.grid((7, 33, 50), seed=2)
+    for thickness in (1, 3, 7, 16):
+        slabs = list(toy.slabs((7, 33, 50), seed=2, slab=thickness))
+        assert [z for z, _ in slabs] == list(range(0, 7, thickness))
+        assert np.array_equal(np.concatenate([slab for _, slab in slabs]), whole)
+
+
+def test_threads_change_nothing(toy_folder):
+    one, four = (load(toy_folder, threads=threads).grid((4, 48, 48), seed=2) for threads in (1, 4))
+    assert np.array_equal(one, four)
+
+
+@pytest.mark.parametrize("distance", [0, 2**20, 10**9])
+def test_a_region_is_bit_identical_whichever_way_it_is_reached(toy, distance):
+    around = toy.grid((9, 40, 70), seed=4, origin=(distance, -distance, 7))
+    inside = toy.grid((2, 11, 13), seed=4, origin=(distance + 33, 5 - distance, 10))
+    assert np.array_equal(around[3:5, 5:16, 33:46], inside)
+
+
+@pytest.mark.parametrize("distance", [10**6, 10**9])
+def test_the_texture_is_as_detailed_far_away_as_at_the_origin(toy, distance):
+    near, far = (toy.grid((1, 64, 64), origin=(start, 0, 0))[0] for start in (0, distance))
+    steps = [np.abs(np.diff(picture, axis=1)).mean() for picture in (near, far)]
+    assert abs(steps[1] / steps[0] - 1) < 0.2
+
+
+def test_seeds_are_different_instances_of_the_same_material(toy):
+    first, second = toy.grid((4, 64, 64), seed=0), toy.grid((4, 64, 64), seed=1)
+    assert np.abs(first - second).mean() > 0.01
+    assert np.abs(first.mean((0, 1, 2)) - second.mean((0, 1, 2))).max() < 0.1
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("distance", [0, 10**9])
+def test_a_tile_repeats_along_its_axes_and_along_no_other(toy, axes, distance):
+    period = (64, 80, 96)  # z, y, x
+    here = toy.grid((5, 5, 5), seed=3, tile=axes, period=period, origin=(distance + 94, 78, 62))
+    for k, axis in enumerate("xyz"):
+        origin = [distance + 94.0, 78.0, 62.0]
+        origin[k] += period[2 - k]
+        difference = np.abs(toy.grid((5, 5, 5), seed=3, tile=axes, period=period, origin=origin) - here).max()
+        assert difference <= 1e-4 if axis in axes else difference > 0.01
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_a_tile_is_continuous_across_its_seam(toy, axes):
+    """Two planes a thousandth of a pixel apart, on either side of the seam, against the same inside the tile."""
+    period = (48, 48, 48)
+    for axis in axes:
+        k = "xyz".index(axis)
+
+        def step(at, k=k):
+            planes = []
+            for side in (-0.0005, 0.0005):
+                origin = np.zeros(3)
+                origin[k] = at + side - 0.5
+                shape = [24, 24, 24]
+                shape[2 - k] = 1
+                planes.append(toy.grid(shape, seed=3, tile=axes, period=period, origin=origin))
+            return np.abs(planes[1] - planes[0]).max()
+
+        assert step(48.0) < 3 * max(step(17.3), step(31.7)) < 0.01
+
+
+def test_a_tiled_texture_keeps_the_look_of_the_plain_one(toy):
+    """Every octave still reads many unrelated texels: neighbouring pixels vary as much, distant ones do not repeat."""
+    plain = toy.grid((1, 128, 128), seed=3)[0].mean(-1)
+    tile = toy.grid((1, 128, 128), seed=3, tile="xyz", period=(128, 128, 128))[0].mean(-1)
+    assert abs(tile.std() / plain.std() - 1) < 0.25
+    centred = tile - tile.mean()
+    correlation = np.fft.ifft2(np.abs(np.fft.fft2(centred)) ** 2).real / (centred**2).sum()
+    assert np.abs(correlation[12:117, 12:117]).max() < 0.35
+
+
+def test_any_number_of_points_can_be_sampled(toy):
+    points = np.random.default_rng(0).uniform(0, 100, (CPU_CHUNK + 1, 3))
+    whole = toy.sample(points)
+    assert np.array_equal(whole[-1:], toy.sample(points[-1:]))
+    assert toy.sample(np.empty((0, 3))).shape == (0, 3)
+
+
+def test_colours_are_clipped_to_the_unit_range(toy_folder, tmp_path):
+    volume = load(toy_folder).grid((8, 64, 64))
+    assert volume.dtype == np.float32
+    assert volume.min() >= 0
+    assert volume.max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda t: t.sample(np.zeros(3)), "points have shape"),
+        (lambda t: t.sample([[0, np.nan, 0]]), "finite"),
+        (lambda t: t.grid((0, 1, 1)), "shape"),
+        (lambda t: t.grid((1, 1)), "shape"),
+        (lambda t: t.grid((1, 1, 1), spacing=0), "spacing"),
+        (lambda t: t.grid((1, 1, 1), spacing=(1, 1, -1)), "spacing"),
+        (lambda t: t.grid((1, 1, 1), origin=(np.inf, 0, 0)), "origin"),
+        (lambda t: t.grid((1, 1, 1), tile="q"), "tile"),
+        (lambda t: t.grid((1, 1, 1), tile="x", period=(0, 1, 1)), "period"),
+        (lambda t: t.slabs((1, 1, 1), slab=0), "slab"),
+        (lambda t: t.grid((1, 1, 1), seed=-1), "seed"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused_with_their_name(toy, call, message):
+    with pytest.raises(EvaluationError, match=message):
+        call(toy)
