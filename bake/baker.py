@@ -38,7 +38,9 @@ def bake(plan: Plan, texture: Texture, on_slice: OnSlice = lambda done, total: N
         evaluation = _feed(plan, texture, writers, on_slice)
         files = [path for writer in writers for path in writer.commit()]
     except OSError as error:
-        raise BakeError(f"cannot write {error.filename or 'the outputs'}: {error.strerror}; free space or bake elsewhere") from error
+        raise BakeError(
+            f"cannot write {error.filename or 'the outputs'}: {error.strerror}; free space or bake elsewhere"
+        ) from error
     finally:
         for writer in writers:
             writer.abort()  # nothing to do for those that have committed
@@ -48,9 +50,7 @@ def bake(plan: Plan, texture: Texture, on_slice: OnSlice = lambda done, total: N
 def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], on_slice: OnSlice) -> float:
     """All slabs to all writers. Returns the seconds spent in the sampler."""
     volume, evaluation, waiting_since = plan.volume, 0.0, time.monotonic()
-    slabs = texture.slabs(
-        volume.shape, plan.seed, origin=plan.origin, spacing=plan.spacing, tile=plan.tile, slab=plan.slab
-    )
+    slabs = texture.slabs(volume.shape, plan.seed, origin=plan.origin, spacing=plan.spacing, tile=plan.tile, slab=plan.slab)
     for z, slab in slabs:
         evaluation += time.monotonic() - waiting_since
         for writer in writers:

@@ -8,7 +8,9 @@ import sys
 
 from solidgrain.runtime.errors import ViewError
 
-PROBE = "import pyvista; p = pyvista.Plotter(off_screen=True, window_size=(16, 16)); p.add_mesh(pyvista.Cube()); p.screenshot(None)"
+PROBE = (
+    "import pyvista; p = pyvista.Plotter(off_screen=True, window_size=(16, 16)); p.add_mesh(pyvista.Cube()); p.screenshot(None)"
+)
 REMEDY = "apt install libegl1 libegl-mesa0 libgl1-mesa-dri (or libosmesa6)"
 
 

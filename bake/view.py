@@ -77,7 +77,7 @@ def show(path: Path, mode: str = "slices", screenshot: Path | None = None, size:
     off_screen_environment()
     import pyvista
 
-    plotter = pyvista.Plotter(off_screen=screenshot is not None, window_size=list(size))
+    plotter: Any = pyvista.Plotter(off_screen=screenshot is not None, window_size=list(size))
     plotter.set_background("#1f1f1f")
     _add(plotter, image, mode, interactive=screenshot is None)
     plotter.add_axes()
@@ -96,7 +96,7 @@ def show(path: Path, mode: str = "slices", screenshot: Path | None = None, size:
         plotter.close()
 
 
-def _add(plotter: pyvista.Plotter, image: pyvista.ImageData, mode: str, interactive: bool) -> None:
+def _add(plotter: Any, image: pyvista.ImageData, mode: str, interactive: bool) -> None:
     """Put the volume on the stage. In a window, slices and threshold have widgets to move them."""
     if mode == "slices":
         if interactive:

@@ -30,4 +30,4 @@ def write_card(name: str, training: dict[str, Any]) -> str:
 
 def with_quality(card: str, table: str) -> str:
     """The card with its quality section written anew."""
-    return card.split(QUALITY)[0].rstrip() + f"\n\n{QUALITY}\n\n{table.rstrip()}\n"
+    return card.split(QUALITY, maxsplit=1)[0].rstrip() + f"\n\n{QUALITY}\n\n{table.rstrip()}\n"

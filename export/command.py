@@ -25,5 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(open_bundle(folder).manifest, indent=2))
     else:
         size = sum(path.stat().st_size for path in folder.iterdir())
-        print(f"{folder}: {size / 1024:.0f} KB; bake it with solidgrain bake {folder} --size 128 --out out.vti", file=sys.stderr)
+        print(
+            f"{folder}: {size / 1024:.0f} KB; bake it with solidgrain bake {folder} --size 128 --out out.vti", file=sys.stderr
+        )
     return 0

@@ -83,7 +83,8 @@ def check_agreement(sampler: Sampler, weights: SamplerWeights, seed: int = 1) ->
 def _random_points(seed: int) -> DoubleArray:
     """Points within 64, 10^4 and 10^9 pixels of the origin, 2048 of each."""
     draw = np.random.default_rng(seed).uniform(-1, 1, (3, 2048, 3))
-    return (draw * np.array([64.0, 1e4, 1e9])[:, None, None]).reshape(-1, 3)
+    points: DoubleArray = (draw * np.array([64.0, 1e4, 1e9])[:, None, None]).reshape(-1, 3)
+    return points
 
 
 def provenance(run: Run, state: dict[str, Any]) -> dict[str, Any]:

@@ -46,9 +46,7 @@ def open_session(path: Path, provider: str) -> onnxruntime.InferenceSession:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3  # errors; they arrive as exceptions as well
     try:
-        session = onnxruntime.InferenceSession(
-            path.read_bytes(), options, providers=[(full_name, OPTIONS.get(full_name, {}))]
-        )
+        session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=[(full_name, OPTIONS.get(full_name, {}))])
     except Exception as error:  # ONNX Runtime raises types of its own, without a common base
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise BundleError(f"{path}: ONNX Runtime cannot load the graph ({reason}); export the bundle again") from error

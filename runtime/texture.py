@@ -57,7 +57,9 @@ def _resolve(source: str, bundle: Path | None) -> tuple[TextureData, Bundle]:
         folder = bundle or find_bundle(data.sampler_sha256, path.parent)
         if folder is None:
             wanted = f"{data.sampler_sha256[:12]}… (texture {data.name!r})"
-            raise BundleError(f"{path}: needs the bundle whose sampler.onnx has sha256 {wanted}; name it with bundle= or --bundle")
+            raise BundleError(
+                f"{path}: needs the bundle whose sampler.onnx has sha256 {wanted}; name it with bundle= or --bundle"
+            )
         return _matching(data, open_bundle(folder))
     owner = open_bundle(embedded_folder(source))
     return _matching(read_texture(owner.folder / TEXTURE), owner)
@@ -79,7 +81,9 @@ def _matching(data: TextureData, owner: Bundle) -> tuple[TextureData, Bundle]:
     }
     for name, array in data.arrays().items():
         if array.shape != expected[name]:
-            raise BundleError(f"{owner.folder}: texture {data.name!r}: {name} has shape {array.shape}, expected {expected[name]}")
+            raise BundleError(
+                f"{owner.folder}: texture {data.name!r}: {name} has shape {array.shape}, expected {expected[name]}"
+            )
     return data, owner
 
 
@@ -97,7 +101,7 @@ class Texture:
     @property
     def provider(self) -> str:
         """The ONNX Runtime execution provider that runs it."""
-        return self._session.get_providers()[0]
+        return str(self._session.get_providers()[0])
 
     @cached_property
     def transforms(self) -> npt.NDArray[np.float64]:
@@ -159,7 +163,7 @@ class Texture:
         tiling = self.tiling(shape, spacing=spacing, tile=tile, period=period)
         instance = self._instance(tiling, seed)
         x, y, z = (
-            tiling.wrap(start[axis] + (np.arange(count) + 0.5) * step[axis], axis)
+            tiling.wrap(start[axis] + (np.arange(count, dtype=np.float64) + 0.5) * step[axis], axis)
             for axis, count in enumerate((columns, rows, depth))
         )
         return (

@@ -28,7 +28,10 @@ def color(weights: SamplerWeights, tables: np.ndarray, point: tuple[float, float
 
 def locate(transform: np.ndarray, point: tuple[float, float, float]) -> list[Fraction]:
     """T p without any rounding."""
-    return [sum((Fraction(float(t)) * Fraction(float(p)) for t, p in zip(row, point, strict=True)), Fraction(0)) for row in transform]
+    return [
+        sum((Fraction(float(t)) * Fraction(float(p)) for t, p in zip(row, point, strict=True)), Fraction(0))
+        for row in transform
+    ]
 
 
 def noise(table: np.ndarray, at: list[Fraction]) -> float:

@@ -7,7 +7,7 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from solidgrain.runtime.errors import TrainingError
 
@@ -30,7 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--preset", choices=("fast", "paper"), default="fast", help="fast: few CPU minutes; paper: the paper's settings (fast)")
     add("--iterations", type=int, metavar="N", help="stop after N iterations in all")
     add("--minutes", type=float, metavar="M", help="stop after M minutes of training in all")
-    add("--anisotropic", nargs="?", const="auto", choices=("auto", "x", "y"), metavar="AXIS", help="oriented material: slices turn about the grain, image axis x or y (measured if not given)")
+    add(
+        "--anisotropic",
+        nargs="?",
+        const="auto",
+        choices=("auto", "x", "y"),
+        metavar="AXIS",
+        help="oriented material: slices turn about the grain, image axis x or y (measured if not given)",
+    )
     add("--patch", type=int, metavar="PX", help="pixels along each side of a patch")
     add("--batch", type=int, metavar="N", help="patches per iteration")
     add("--seed", type=int, default=0, metavar="N", help="of all randomness (0)")
@@ -48,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     from solidgrain.runtime.provider import usable_threads
     from solidgrain.train.loop import train
 
+    check_budget(arguments)
     device = choose_device(arguments.device)
     torch.set_num_threads(arguments.threads or usable_threads())
     training = resume(arguments) if arguments.resume else start(arguments)
@@ -104,7 +112,7 @@ def with_grain(settings: Settings, anisotropic: str | None, exemplar: Any) -> Se
     if anisotropic is None:
         return settings
     grain = measure_grain(exemplar)
-    axis = grain.axis if anisotropic == "auto" else anisotropic
+    axis: Literal["x", "y"] = grain.axis if anisotropic == "auto" else "x" if anisotropic == "x" else "y"
     ratio = grain.ratio if settings.preset == "fast" and axis == grain.axis else 1.0
     return replace(settings, grain=axis, grain_ratio=ratio)
 
@@ -117,15 +125,18 @@ def resume(arguments: argparse.Namespace) -> Run:
     return open_run(arguments.resume)
 
 
+def check_budget(arguments: argparse.Namespace) -> None:
+    for name in ("iterations", "minutes"):
+        value = getattr(arguments, name)
+        if value is not None and not value > 0:
+            raise TrainingError(f"--{name} {value}: expected more than 0")
+
+
 def make_budget(arguments: argparse.Namespace, settings: Settings) -> Budget:
     """How long to train: what the flags say, or the preset's iterations."""
     from solidgrain.train.loop import Budget
     from solidgrain.train.settings import PRESET_ITERATIONS
 
-    for name in ("iterations", "minutes"):
-        value = getattr(arguments, name)
-        if value is not None and not value > 0:
-            raise TrainingError(f"--{name} {value}: expected more than 0")
     if arguments.iterations is None and arguments.minutes is None:
         return Budget(iterations=PRESET_ITERATIONS[settings.preset])
     return Budget(arguments.iterations, arguments.minutes)
@@ -137,7 +148,9 @@ def choose_device(name: str) -> torch.device:
 
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
-        raise TrainingError(f"--device cuda: torch {torch.__version__} sees no CUDA device; use --device cpu or install a CUDA build")
+        raise TrainingError(
+            f"--device cuda: torch {torch.__version__} sees no CUDA device; use --device cpu or install a CUDA build"
+        )
     return torch.device("cuda" if name == "cuda" or (name == "auto" and available) else "cpu")
 
 

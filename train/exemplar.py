@@ -75,8 +75,7 @@ def _encode(rgb: FloatArray, color_space: str) -> FloatArray:
     converted = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(rgb), color_space or "lin_rec709_scene", "srgb_rec709_scene")
     if converted.has_error:
         raise ExemplarError(f"colour space {color_space!r}: {_first_line(converted.geterror())}")
-    encoded: FloatArray = converted.get_pixels(oiio.FLOAT)
-    return encoded
+    return np.asarray(converted.get_pixels(oiio.FLOAT), np.float32)
 
 
 def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:

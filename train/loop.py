@@ -79,13 +79,13 @@ class Trainer:
 
         critic_loss, penalty = self._critic_loss(real, fake.detach())
         self.critic_optimiser.zero_grad()
-        critic_loss.backward()
+        torch.autograd.backward(critic_loss)
         self.critic_optimiser.step()
 
         self.critic.requires_grad_(False)  # the sampler's step needs its activations, not its gradients
         style, adversarial = self._sampler_losses(real, fake)
         self.sampler_optimiser.zero_grad()
-        (settings.beta * style - settings.alpha * adversarial).backward()
+        torch.autograd.backward(settings.beta * style - settings.alpha * adversarial)
         self.sampler_optimiser.step()
         self.critic.requires_grad_(True)
 
@@ -104,8 +104,11 @@ class Trainer:
         """A batch of random slices of one fresh noise instance, as images."""
         settings = self.settings
         tables = draw_tables(settings.octaves, settings.resolution, self.generator)
+        points = draw_slices(
+            settings, self.generator
+        )  # outside autocast: coordinates in bfloat16 are off by a tenth of a pixel
         with self._autocast():
-            rgb = self.sampler(tables, draw_slices(settings, self.generator))
+            rgb: Tensor = self.sampler(tables, points)
         return rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
 
     def _critic_loss(self, real: Tensor, fake: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -204,11 +207,10 @@ def use_bfloat16(settings: Settings, device: torch.device) -> bool:
     if settings.precision != "auto":
         return settings.precision == "bfloat16"
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
 
 
 def _write_sample(trainer: Trainer) -> None:
     path = trainer.run.folder / "samples" / f"{trainer.iteration:06d}.png"
     write_preview(path, trainer.average, trainer.settings, trainer.run.exemplar, trainer.device)
-

@@ -19,7 +19,8 @@ def gradient_penalty(critic: Critic, real: Tensor, fake: Tensor, generator: torc
     along = torch.rand(len(real), 1, 1, 1, generator=generator, device=generator.device)
     between = (real + along * (fake - real)).requires_grad_(True)
     (gradient,) = torch.autograd.grad(critic(between)[0].sum(), between, create_graph=True)
-    return ((gradient.flatten(1).norm(dim=1) - 1) ** 2).mean()
+    penalty: Tensor = ((gradient.flatten(1).norm(dim=1) - 1) ** 2).mean()
+    return penalty
 
 
 def style_loss(real: Sequence[Tensor], fake: Sequence[Tensor], pooled: bool) -> Tensor:

@@ -184,7 +184,8 @@ def _frechet(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> float:
 
 def _gram(features: Tensor) -> Tensor:
     flat = features.flatten(2)[0]
-    return flat @ flat.T / flat.shape[1]
+    gram: Tensor = flat @ flat.T / flat.shape[1]
+    return gram
 
 
 def _gram_distance(exemplar: list[Tensor], other: list[Tensor]) -> float:
@@ -197,7 +198,8 @@ def _projections(vectors: Tensor, count: int) -> Tensor:
     generator = torch.Generator().manual_seed(1)
     directions = torch.randn(vectors.shape[1], count, generator=generator)
     chosen = torch.randperm(len(vectors), generator=generator)[:20000]
-    return (vectors[chosen] @ (directions / directions.norm(dim=0))).sort(0).values
+    projected: Tensor = (vectors[chosen] @ (directions / directions.norm(dim=0))).sort(0).values
+    return projected
 
 
 def _wasserstein(a: Tensor, b: Tensor) -> float:

@@ -1,10 +1,10 @@
 """The run directory: what a training leaves on disk, and how it is taken up again.
 
-    RUN/options.json     settings, exemplar, provenance
-    RUN/exemplar.npy     the pixels that it trains on, [H, W, 3] float32
-    RUN/stats.jsonl      one line per report: iteration, seconds, losses
-    RUN/samples/*.png    the exemplar, an axis-aligned and an oblique slice
-    RUN/checkpoint.pt    everything that the next iteration depends on, replaced whole
+RUN/options.json     settings, exemplar, provenance
+RUN/exemplar.npy     the pixels that it trains on, [H, W, 3] float32
+RUN/stats.jsonl      one line per report: iteration, seconds, losses
+RUN/samples/*.png    the exemplar, an axis-aligned and an oblique slice
+RUN/checkpoint.pt    everything that the next iteration depends on, replaced whole
 """
 
 from __future__ import annotations
@@ -63,7 +63,9 @@ class Run:
         try:
             state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # torch raises a dozen unrelated types for damaged files
-            raise TrainingError(f"{path}: damaged checkpoint ({type(error).__name__}); start the run again elsewhere") from error
+            raise TrainingError(
+                f"{path}: damaged checkpoint ({type(error).__name__}); start the run again elsewhere"
+            ) from error
         return state
 
     def append_stats(self, line: dict[str, Any]) -> None:

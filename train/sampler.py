@@ -38,9 +38,9 @@ class Sampler(nn.Module):
         """Colour at points: tables [n, R, R, R], points [B, P, 3] -> rgb [B, P, 3], not clipped to [0, 1]."""
         eta = look_up(tables, self.transforms(), points)  # (B, P, n)
         bins = eta.chunk(BINS, dim=-1)
-        x = self.constant
+        x: Tensor = self.constant
         for layer, dense in enumerate(self.hidden):
-            y = dense(x)
+            y: Tensor = dense(x)
             if layer < BINS:
                 y = y + bins[layer] @ self.noise_weights[layer]  # psi(eta) = A eta
             x = activate(y)

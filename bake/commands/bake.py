@@ -27,7 +27,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, action="append", default=[], metavar="FILE", help="granite.####.exr, .vti or .npy; repeatable")
     add("--preview", type=Path, metavar="FILE.png", help="a PNG with three slices and the turned block")
     add("--seed", type=parse_seed, default=0, metavar="N", help="which instance of the texture (0)")
-    add("--origin", type=parse_vector, default=(0.0, 0.0, 0.0), metavar="X,Y,Z", help="corner of the grid, exemplar pixels (0,0,0)")
+    add(
+        "--origin",
+        type=parse_vector,
+        default=(0.0, 0.0, 0.0),
+        metavar="X,Y,Z",
+        help="corner of the grid, exemplar pixels (0,0,0)",
+    )
     add("--spacing", type=parse_spacing, default=(1.0, 1.0, 1.0), metavar="S|X,Y,Z", help="exemplar pixels per voxel (1)")
     add("--tile", type=parse_tile, default="", metavar="AXES", help="axes that repeat seamlessly, any of xyz")
     add("--vti-type", choices=("uint8", "float32"), default="uint8", help="of the colours in .vti (uint8)")
@@ -130,10 +136,17 @@ def summary(report: dict[str, Any]) -> str:
 
     plan = report["plan"]
     lines = [f"texture   {plan['texture']}, seed {plan['seed']}", f"size      {format_size(plan['size'])} voxels (x, y, z)"]
-    lines += [f"output    {path}: at most {format_bytes(size)}, {report['color_encoding'][path]}" for path, size in report["bytes_at_most"].items()]
-    lines += [f"memory    about {format_bytes(report['memory_bytes'])}", f"time      about {report['seconds']:g} s on {report['threads']} threads"]
+    lines += [
+        f"output    {path}: at most {format_bytes(size)}, {report['color_encoding'][path]}"
+        for path, size in report["bytes_at_most"].items()
+    ]
+    lines += [
+        f"memory    about {format_bytes(report['memory_bytes'])}",
+        f"time      about {report['seconds']:g} s on {report['threads']} threads",
+    ]
     if report["tile_distortion"]:
-        lines.append(f"tiling    {plan['tile']}; octaves move by {min(report['tile_distortion']):.1%} to {max(report['tile_distortion']):.1%}")
+        least, most = min(report["tile_distortion"]), max(report["tile_distortion"])
+        lines.append(f"tiling    {plan['tile']}; octaves move by {least:.1%} to {most:.1%}")
     return "\n".join(lines)
 
 
@@ -164,7 +177,12 @@ class Progress:
         seconds = time.monotonic() - self.started
         filled = 30 * done // total
         left = seconds * (total - done) / done
-        print(f"\r[{'#' * filled}{'.' * (30 - filled)}] slice {done}/{total}, {left:.0f} s left ", end="", file=sys.stderr, flush=True)
+        print(
+            f"\r[{'#' * filled}{'.' * (30 - filled)}] slice {done}/{total}, {left:.0f} s left ",
+            end="",
+            file=sys.stderr,
+            flush=True,
+        )
 
     def finish(self, plan: Plan, baked: Baked) -> None:
         if self.quiet:
@@ -175,7 +193,7 @@ class Progress:
 
 
 def parse_size(text: str) -> tuple[int, int, int]:
-    """"128" or "256x128x64" (x, y, z)."""
+    """ "128" or "256x128x64" (x, y, z)."""
     parts = text.replace(",", "x").split("x")
     numbers = [int(part) if part.isdecimal() else 0 for part in (parts * 3 if len(parts) == 1 else parts)]
     if len(numbers) != 3 or min(numbers) < 1:

@@ -82,7 +82,9 @@ def _textures(problems: list[str]) -> dict[str, float]:
     from solidgrain.runtime import embedded_names, load
 
     errors = {name: probe_error(load(name)) for name in embedded_names()}
-    problems += [f"{name}: colours differ from the manifest by {error:.1g}" for name, error in errors.items() if error > TOLERANCE]
+    problems += [
+        f"{name}: colours differ from the manifest by {error:.1g}" for name, error in errors.items() if error > TOLERANCE
+    ]
     return errors
 
 

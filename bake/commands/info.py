@@ -42,12 +42,14 @@ def probe_error(texture: Texture) -> float:
 def summary(texture: Texture, error: float) -> str:
     manifest: dict[str, Any] = texture.bundle.manifest
     training = manifest["training"]
-    exemplars = ", ".join(f"{entry['exemplar']} ({entry['license']}; {entry['credit']})" for entry in training.get("exemplars", []))
+    exemplars = ", ".join(
+        f"{entry['exemplar']} ({entry['license']}; {entry['credit']})" for entry in training.get("exemplars", [])
+    )
     verdict = "reproduced" if error <= TOLERANCE else "NOT REPRODUCED"
     lines = [
         f"texture    {texture.name}",
         f"bundle     {texture.bundle.folder}, format {manifest['format_version']}, {manifest['producer']}",
-        f"sampler    {manifest['octaves']} octaves, {manifest['hidden_layers']} x {manifest['width']} units, opset {manifest['opset']}",
+        f"sampler    {manifest['octaves']} octaves, {manifest['hidden_layers']} layers of {manifest['width']} units",
         f"colour     {manifest['color_encoding']}",
         f"probe      {verdict} on {texture.provider}, largest difference {error:.1g}",
     ]

@@ -111,9 +111,12 @@ def draw_block(faces: Sequence[FloatArray], extents: Sequence[int]) -> FloatArra
     for axis, face in enumerate(faces):
         seen = (near < far) & (entered == axis)
         column_axis, row_axis = [other for other in (0, 1, 2) if other != axis]
-        rows, columns = (_index(position[seen][:, k], count) for k, count in zip((row_axis, column_axis), face.shape, strict=False))
+        rows, columns = (
+            _index(position[seen][:, k], count) for k, count in zip((row_axis, column_axis), face.shape, strict=False)
+        )
         picture[seen] = face[rows, columns] * SHADE[axis]
-    return picture.reshape(PANEL, SAMPLES, PANEL, SAMPLES, 3).mean((1, 3), dtype=np.float32)
+    block: FloatArray = picture.reshape(PANEL, SAMPLES, PANEL, SAMPLES, 3).mean((1, 3), dtype=np.float32)
+    return block
 
 
 def _index(position: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.int64]:

@@ -65,7 +65,7 @@ def test_a_missing_file_is_named(broken, name):
 
 def test_a_missing_manifest_is_named(broken):
     (broken / "manifest.json").unlink()
-    with pytest.raises(BundleError, match="no manifest.json"):
+    with pytest.raises(BundleError, match=r"no manifest\.json"):
         load(broken)
 
 

@@ -1,0 +1,53 @@
+# Everything happens in .venv, so nothing outside this folder changes. CI calls these targets and no others.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+TORCH ?= torch==2.13.0
+WHEEL_VENV := build/wheel-venv
+
+.PHONY: install check test test-slow wheel test-wheel bench pictures clean
+
+install: $(VENV)/installed
+
+# torch first and by exact version: a bare "torch" may bring gigabytes of CUDA libraries along.
+$(VENV)/installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet $(TORCH)
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@
+
+# Type checkers cannot follow the editable import hook: they look at a tree of links instead.
+check: install
+	mkdir -p build/typing/solidgrain
+	for part in train export runtime bake; do ln -sfn ../../../$$part build/typing/solidgrain/$$part; done
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+test: install
+	$(BIN)/python -m pytest -m 'not slow'
+
+test-slow: install
+	$(BIN)/python -m pytest
+
+wheel: install
+	rm -rf dist build/lib build/bdist.*
+	$(BIN)/python -m build --wheel --outdir dist .
+
+# The built wheel in an environment of its own, without torch: what a pipeline installs.
+test-wheel: wheel
+	rm -rf $(WHEEL_VENV)
+	$(PYTHON) -m venv $(WHEEL_VENV)
+	$(WHEEL_VENV)/bin/python -m pip install --quiet "$$(ls dist/*.whl)[test]"
+	! $(WHEEL_VENV)/bin/python -c 'import torch' 2>/dev/null
+	$(WHEEL_VENV)/bin/python -m pytest tests/runtime tests/bake
+
+bench: install
+	$(BIN)/python tests/bench/bench.py
+
+pictures: install
+	$(BIN)/python docs/pictures.py
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache *.egg-info

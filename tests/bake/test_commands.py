@@ -1,0 +1,121 @@
+"""`view`, `info` and `doctor`."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from solidgrain.bake import opengl
+
+
+@pytest.fixture(scope="module")
+def volume(tmp_path_factory, toy_folder):
+    from solidgrain.bake.cli import main
+
+    folder = tmp_path_factory.mktemp("volume")
+    outputs = ["--out", str(folder / "a.vti"), "--out", str(folder / "a.npy")]
+    assert main(["bake", str(toy_folder), "--size", "24x20x16", "--quiet", *outputs]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def drawing():
+    if reason := opengl.opengl_error():
+        pytest.skip(f"VTK cannot draw here: {reason}")
+
+
+@pytest.mark.parametrize("mode", ["slices", "volume", "threshold", "block"])
+@pytest.mark.parametrize("name", ["a.vti", "a.npy"])
+def test_a_screenshot_shows_the_volume_in_colour(solidgrain, drawing, volume, tmp_path, name, mode):
+    outcome = solidgrain("view", volume / name, "--mode", mode, "--screenshot", tmp_path / "view.png")
+    assert outcome.code == 0, outcome.err
+    picture = oiio.ImageBuf(os.fspath(tmp_path / "view.png")).get_pixels(oiio.FLOAT)
+    shown = picture[np.abs(picture - picture[0, 0]).max(-1) > 0.05]
+    assert len(shown) > 0.05 * picture.shape[0] * picture.shape[1]
+    assert shown[:, 0].mean() > shown[:, 2].mean()  # the toy texture is reddish
+    assert [path.name for path in tmp_path.iterdir()] == ["view.png"]
+
+
+def test_without_opengl_there_is_an_error_instead_of_a_crash(solidgrain, volume, tmp_path, monkeypatch):
+    """The probe of a machine without OpenGL dies of a segmentation fault; so does this one."""
+    monkeypatch.setattr(opengl, "PROBE", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    outcome = solidgrain("view", volume / "a.vti", "--screenshot", tmp_path / "view.png")
+    assert outcome.code == 1
+    assert "no OpenGL library; apt install" in outcome.error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_window_needs_a_display(solidgrain, volume, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    outcome = solidgrain("view", volume / "a.vti")
+    assert outcome.code == 1
+    assert "--screenshot" in outcome.error
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("none.vti", None), ("bad.vti", b"hello"), ("bad.npy", b"hello"), ("empty.vti", b""), ("odd.xyz", b"?")],
+)
+def test_a_file_that_is_no_volume_is_refused(solidgrain, tmp_path, name, content):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    outcome = solidgrain("view", tmp_path / name, "--screenshot", tmp_path / "view.png")
+    assert outcome.code == 1
+    assert name in outcome.err
+    assert not (tmp_path / "view.png").exists()
+
+
+def test_info_says_what_granite_is_and_that_it_is_reproduced(solidgrain):
+    outcome = solidgrain("info")
+    assert outcome.code == 0
+    assert "probe      reproduced" in outcome.out
+    assert "CC0" in outcome.out
+    report = json.loads(solidgrain("info", "granite", "--json").out)
+    assert report["probe_error"] < 1e-4
+    assert report["training"]["exemplars"][0]["license"]
+
+
+def test_info_exits_with_3_when_the_colours_are_not_those_of_the_manifest(solidgrain, toy_folder, tmp_path):
+    folder = shutil.copytree(toy_folder, tmp_path / "toy")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["probe"]["rgb"][0][0] += 0.1
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    outcome = solidgrain("info", folder)
+    assert outcome.code == 3
+    assert "NOT REPRODUCED" in outcome.out
+
+
+def test_doctor_reports_a_healthy_installation(solidgrain):
+    report = json.loads(solidgrain("doctor", "--json").out)
+    assert report["providers"]["cpu"] == "works"
+    assert report["onnxruntime_builds"] == ["onnxruntime"]
+    assert report["textures"]["granite"] < 1e-4
+    assert report["problems"] == []
+    assert "OpenGL" in solidgrain("doctor").out
+
+
+def test_doctor_finds_two_builds_of_onnx_runtime(solidgrain, tmp_path, monkeypatch):
+    package = tmp_path / "onnxruntime_gpu-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: onnxruntime-gpu\nVersion: 1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    outcome = solidgrain("doctor")
+    assert outcome.code == 1
+    assert "onnxruntime and onnxruntime-gpu are installed together" in outcome.out
+
+
+def test_a_missing_extra_is_named(tmp_path, toy_folder):
+    code = "import sys; sys.modules['OpenEXR'] = None; from solidgrain.bake.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "bake", str(toy_folder), "--size", "2", "--out", str(tmp_path / "a.#.exr")]
+    outcome = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert outcome.returncode == 1
+    assert outcome.stderr.strip() == "solidgrain: bake needs the package OpenEXR; pip install 'solidgrain[bake]'"
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,149 @@
+"""What is written is what was evaluated: read back by OpenImageIO, OpenEXR, VTK and numpy at chosen voxels.
+
+The volume has three different extents and a random texture, which has no symmetry: any swapped or mirrored axis shows.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import OpenEXR
+import OpenImageIO as oiio
+import pytest
+import pyvista
+
+from solidgrain.bake.baker import bake
+from solidgrain.bake.color import to_linear
+from solidgrain.bake.plan import Plan
+from solidgrain.bake.writers import Output, make_output
+
+SIZE = (7, 5, 19)  # x, y, z: more slices than one slab
+ORIGIN, SPACING = (10.0, -20.0, 1000.0), (1.0, 0.5, 2.0)
+VOXELS = [(0, 0, 0), (6, 0, 0), (0, 4, 0), (0, 0, 18), (6, 4, 18), (3, 1, 17)]
+
+
+def plan_for(texture, *outputs: Output, tile: str = "") -> Plan:
+    return Plan(
+        source="toy",
+        texture="toy",
+        sampler_sha256=texture.data.sampler_sha256,
+        seed=7,
+        size=SIZE,
+        origin=ORIGIN,
+        spacing=SPACING,
+        tile=tile,
+        outputs=outputs,
+    )
+
+
+def expected(texture, x: int, y: int, z: int) -> np.ndarray:
+    """The colour at a voxel, asked of the texture point by point."""
+    point = [o + (k + 0.5) * s for o, k, s in zip(ORIGIN, (x, y, z), SPACING, strict=True)]
+    return texture.sample([point], seed=7)[0]
+
+
+@pytest.fixture(scope="module")
+def baked(toy, tmp_path_factory):
+    """All formats in one pass."""
+    folder = tmp_path_factory.mktemp("baked")
+    outputs = [
+        make_output(folder / "toy.####.exr", start=1),
+        make_output(folder / "toy.vti", dtype="uint8"),
+        make_output(folder / "float.vti", dtype="float32"),
+        make_output(folder / "toy.npy"),
+        Output(folder / "toy.png", "preview"),
+    ]
+    result = bake(plan_for(toy, *outputs), toy)
+    assert sorted(path.name for path in result.files) == sorted(path.name for path in folder.iterdir())
+    return folder
+
+
+@pytest.mark.parametrize(("x", "y", "z"), VOXELS)
+def test_exr_slices_read_by_openexr(baked, toy, x, y, z):
+    with OpenEXR.File(os.fspath(baked / f"toy.{z + 1:04d}.exr")) as file:
+        pixels = file.channels()["RGB"].pixels
+        assert pixels.dtype == np.float16
+        assert pixels.shape == (5, 7, 3)
+        np.testing.assert_allclose(pixels[y, x], to_linear(expected(toy, x, y, z)), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("x", "y", "z"), VOXELS)
+def test_exr_slices_read_by_openimageio(baked, toy, x, y, z):
+    image = oiio.ImageBuf(os.fspath(baked / f"toy.{z + 1:04d}.exr"))
+    assert image.spec().get_string_attribute("oiio:ColorSpace") == "lin_rec709_scene"
+    srgb = oiio.ImageBufAlgo.colorconvert(image, "lin_rec709_scene", "srgb_rec709_scene")
+    np.testing.assert_allclose(srgb.getpixel(x, y), expected(toy, x, y, z), atol=1e-3)
+
+
+def test_exr_attributes_say_what_a_slice_is(baked, toy):
+    with OpenEXR.File(os.fspath(baked / "toy.0005.exr")) as file:
+        header = file.header()
+    assert oiio.ImageBuf(os.fspath(baked / "toy.0005.exr")).spec()["compression"] == "zip"
+    assert header["colorInteropID"] == "lin_rec709_scene"
+    assert header["solidgrain:slice"] == 4
+    assert header["solidgrain:depth"] == 19
+    assert header["solidgrain:seed"] == "7"
+    assert header["solidgrain:model"] == toy.data.sampler_sha256
+    assert tuple(header["solidgrain:origin"]) == ORIGIN
+    assert tuple(header["solidgrain:spacing"]) == SPACING
+
+
+@pytest.mark.parametrize(("x", "y", "z"), VOXELS)
+@pytest.mark.parametrize(("name", "tolerance"), [("toy.vti", 0.5 / 255 + 1e-6), ("float.vti", 0)])
+def test_vti_read_by_vtk_at_the_sampled_point(baked, toy, name, tolerance, x, y, z):
+    image = pyvista.read(baked / name)
+    assert image.dimensions == SIZE
+    index = x + SIZE[0] * (y + SIZE[1] * z)
+    point = [o + (k + 0.5) * s for o, k, s in zip(ORIGIN, (x, y, z), SPACING, strict=True)]
+    np.testing.assert_allclose(image.points[index], point)
+    scale = 255 if name == "toy.vti" else 1
+    np.testing.assert_allclose(image.point_data["rgb"][index] / scale, expected(toy, x, y, z), atol=tolerance)
+    assert image.field_data["color_encoding"] == ["srgb_rec709_scene"]
+
+
+def test_npy_is_the_grid_bit_for_bit(baked, toy):
+    grid = toy.grid(SIZE[::-1], seed=7, origin=ORIGIN, spacing=SPACING)
+    assert np.array_equal(np.load(baked / "toy.npy"), grid)
+    for x, y, z in VOXELS:
+        assert np.array_equal(grid[z, y, x], expected(toy, x, y, z))
+
+
+def test_the_preview_shows_the_slices_and_the_faces(baked, toy):
+    picture = oiio.ImageBuf(os.fspath(baked / "toy.png")).get_pixels(oiio.FLOAT)
+    assert picture.shape == (384, 4 * 384 + 3 * 12, 3)
+    middle = picture[192, 192]  # of the first panel: the middle of z = 9
+    np.testing.assert_allclose(middle, expected(toy, 3, 2, 9), atol=1 / 255)
+    assert picture[:, -384:].std() > 0.05
+
+
+def test_two_bakes_are_the_same_bytes(baked, toy, tmp_path):
+    outputs = [
+        make_output(tmp_path / "toy.####.exr", start=1),
+        make_output(tmp_path / "toy.vti"),
+        Output(tmp_path / "toy.png", "preview"),
+    ]
+    for path in bake(plan_for(toy, *outputs), toy).files:
+        assert path.read_bytes() == (baked / path.name).read_bytes(), path.name
+
+
+def test_a_tiled_volume_meets_itself_in_the_written_files(toy, tmp_path):
+    """The step from the last voxel of the tile to its first is a step like any other, on every axis."""
+    bake(plan_for(toy, make_output(tmp_path / "tile.npy"), tile="xyz"), toy)
+    tile = np.load(tmp_path / "tile.npy")
+    twice = toy.grid([2 * n for n in SIZE[::-1]], seed=7, origin=ORIGIN, spacing=SPACING, tile="xyz", period=SIZE[::-1])
+    assert np.abs(twice - np.tile(tile, (2, 2, 2, 1))).max() <= 1e-4
+
+
+def test_a_nan_leaves_nothing_behind(toy, tmp_path, monkeypatch):
+    from solidgrain.runtime import EvaluationError
+
+    def slabs(*arguments, **keywords):
+        yield 0, np.zeros((16, 5, 7, 3), np.float32)
+        raise EvaluationError("the sampler returned NaN")
+
+    monkeypatch.setattr(type(toy), "slabs", slabs)
+    outputs = [make_output(tmp_path / name) for name in ("a.####.exr", "a.vti", "a.npy")]
+    with pytest.raises(EvaluationError):
+        bake(plan_for(toy, *outputs, Output(tmp_path / "a.png", "preview")), toy)
+    assert list(tmp_path.iterdir()) == []

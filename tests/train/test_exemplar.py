@@ -1,0 +1,133 @@
+"""Photographs of every kind are read, or refused in one line."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+
+from solidgrain.runtime import ExemplarError
+from solidgrain.train.exemplar import draw_patches, measure_grain, nonstationarity, read_exemplar
+from solidgrain.train.settings import preset
+from tests.train.conftest import blotches
+
+
+def write(path, pixels, kind=oiio.UINT8, **attributes):
+    image = oiio.ImageBuf(np.ascontiguousarray(pixels, np.float32))
+    for name, value in attributes.items():
+        image.specmod().attribute(name, value)
+    assert image.write(os.fspath(path), kind), image.geterror()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "channels", "kind", "tolerance"),
+    [
+        ("rgb.png", 3, oiio.UINT8, 0.5 / 255),
+        ("rgb16.png", 3, oiio.UINT16, 0.5 / 65535),
+        ("rgba.png", 4, oiio.UINT8, 0.5 / 255),
+        ("grey.png", 1, oiio.UINT8, 0.5 / 255),
+        ("grey16.tif", 1, oiio.UINT16, 0.5 / 65535),
+        ("greyalpha.png", 2, oiio.UINT8, 0.5 / 255),
+        ("rgb.tif", 3, oiio.FLOAT, 1e-6),
+    ],
+)
+def test_eight_and_sixteen_bit_grey_and_alpha(tmp_path, name, channels, kind, tolerance):
+    pixels = blotches(70, 90)
+    if channels in {2, 4}:
+        pixels = np.concatenate([pixels[..., : channels - 1], np.ones((70, 90, 1), np.float32)], axis=-1)
+    pixels = pixels[..., :channels]
+    if name == "rgb.tif":
+        write(tmp_path / name, pixels, kind, **{"oiio:ColorSpace": "srgb_rec709_scene"})
+    else:
+        write(tmp_path / name, pixels, kind)
+    exemplar = read_exemplar(tmp_path / name, 64)
+    assert exemplar.shape == (70, 90, 3)
+    assert exemplar.dtype == np.float32
+    if name != "rgb.tif":
+        wanted = pixels[..., :3] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
+        np.testing.assert_allclose(exemplar, wanted, atol=tolerance + 1e-6)
+
+
+def test_cmyk_is_converted(tmp_path):
+    image = oiio.ImageBuf(oiio.ImageSpec(80, 80, 4, "uint8"))
+    oiio.ImageBufAlgo.fill(image, (0.0, 1.0, 1.0, 0.0))  # no cyan, all magenta and yellow, no black: red
+    image.specmod().channelnames = ("C", "M", "Y", "K")
+    image.specmod().attribute("tiff:PhotometricInterpretation", 5)
+    image.specmod().attribute("tiff:ColorSpace", "CMYK")
+    if not image.write(os.fspath(tmp_path / "cmyk.tif")) or "CMYK" not in oiio.ImageBuf(
+        os.fspath(tmp_path / "cmyk.tif")
+    ).spec().get_string_attribute("tiff:ColorSpace"):
+        pytest.skip(f"this OpenImageIO cannot write CMYK: {image.geterror()}")
+    red = read_exemplar(tmp_path / "cmyk.tif", 64).mean((0, 1))
+    assert red[0] > 0.8
+    assert max(red[1], red[2]) < 0.3
+
+
+def test_linear_files_are_encoded(tmp_path):
+    write(tmp_path / "linear.exr", np.full((64, 64, 3), 0.5), oiio.HALF)
+    assert read_exemplar(tmp_path / "linear.exr", 64)[0, 0, 0] == pytest.approx(0.7354, abs=1e-3)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_a_truncated_file_is_refused(tmp_path, suffix):
+    path = write(tmp_path / f"cut.{suffix}", blotches(200, 200))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(ExemplarError, match="damaged or cut short"):
+        read_exemplar(path, 64)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("missing.png", None, "no such file"),
+        ("empty.png", b"", "empty"),
+        ("text.png", b"hello", "not readable"),
+        ("text.txt", b"hello", "not readable"),
+    ],
+)
+def test_a_file_that_is_no_photograph_is_refused(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(ExemplarError, match=message):
+        read_exemplar(tmp_path / name, 64)
+
+
+def test_a_tiny_photograph_is_refused_with_the_size_that_is_needed(tmp_path):
+    write(tmp_path / "tiny.png", blotches(64, 63))
+    with pytest.raises(ExemplarError, match="63x64 pixels, expected at least 64x64"):
+        read_exemplar(tmp_path / "tiny.png", 64)
+
+
+def test_a_huge_photograph_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / "huge.png"
+    assert oiio.ImageBuf(oiio.ImageSpec(8193, 8193, 1, "uint8")).write(os.fspath(path))
+    with pytest.raises(ExemplarError, match="at most 64 megapixels"):
+        read_exemplar(path, 64)
+
+
+def test_patches_come_from_the_exemplar_flipped_and_transposed(photograph):
+    image = torch.from_numpy(read_exemplar(photograph, 64)).permute(2, 0, 1)
+    generator = torch.Generator().manual_seed(0)
+    patches = draw_patches(image, preset("fast", batch=32), generator)
+    assert patches.shape == (32, 3, 64, 64)
+    crops = {image[:, y : y + 64, x : x + 64].sum().item() for y in range(17) for x in range(33)}
+    assert all(min(abs(patch.sum().item() - crop) for crop in crops) < 0.05 for patch in patches)
+
+
+def test_the_grain_of_stripes_is_along_them():
+    draw = np.random.default_rng(0)
+    rows = np.repeat(np.convolve(draw.random(260), np.ones(5) / 5, "valid")[:, None], 256, axis=1)
+    stripes = np.stack([rows + 0.2 * draw.random(rows.shape)] * 3, -1).astype(np.float32)
+    assert measure_grain(stripes).axis == "x"
+    assert measure_grain(stripes.transpose(1, 0, 2)).axis == "y"
+    assert measure_grain(stripes).ratio < 0.2
+
+
+def test_nonstationarity_tells_a_gradient_from_an_even_texture():
+    even = blotches(128, 128)
+    gradient = even * 0.3 + np.linspace(0, 0.7, 128, dtype=np.float32)[:, None, None]
+    assert nonstationarity(even) < 0.3 < nonstationarity(gradient)

@@ -1,0 +1,144 @@
+"""The networks are the paper's, and each loss does what its equation says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from solidgrain.train.critic import Critic
+from solidgrain.train.losses import gradient_penalty, gram_matrix, style_loss
+from solidgrain.train.noise import look_up
+from solidgrain.train.sampler import Sampler
+from solidgrain.train.settings import FAST, PAPER, preset, rate
+from solidgrain.train.slices import about_axis, draw_rotations, draw_slices, flat_slice
+from tests.reference import locate, noise
+
+
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def test_the_critic_has_the_paper_s_layers():
+    logits, activations = Critic(generator())(torch.zeros(2, 3, 128, 128))
+    assert logits.shape == (2, 1)
+    shapes = [tuple(activation.shape[1:]) for activation in activations]
+    assert shapes == [
+        (32, 128, 128), (64, 128, 128), (64, 64, 64), (128, 64, 64), (128, 32, 32),
+        (256, 16, 16), (256, 8, 8), (256, 4, 4), (256, 2, 2),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("size", [32, 64, 200])
+def test_the_critic_takes_other_patch_sizes(size):
+    assert Critic(generator())(torch.zeros(1, 3, size, size))[0].shape == (1, 1)
+
+
+def test_noise_lookup_is_trilinear_and_periodic():
+    settings = preset("fast", octaves=4)
+    tables = torch.randn(4, 64, 64, 64, generator=generator())
+    transforms = Sampler(settings, generator()).transforms().detach()
+    points = torch.randn(1, 20, 3, generator=generator()) * 40
+    found = look_up(tables, transforms, points)[0]
+    for point, values in zip(points[0], found, strict=True):
+        for table, transform, value in zip(tables, transforms, values, strict=True):
+            expected = noise(table.numpy(), locate(transform.numpy(), tuple(point.tolist())))
+            assert value.item() == pytest.approx(expected, abs=2e-3)  # float32 coordinates, up to 5000 texels out
+
+
+def test_noise_lookup_stays_in_float32_under_autocast():
+    tables, points = torch.randn(4, 64, 64, 64, generator=generator()), torch.rand(1, 50, 3, generator=generator()) * 4
+    transforms = torch.randn(4, 3, 3, generator=generator()) * 8
+    with torch.autocast("cpu", torch.bfloat16):
+        reduced = look_up(tables, transforms, points)
+    assert reduced.dtype == torch.float32
+    assert torch.equal(reduced, look_up(tables, transforms, points))
+
+
+def test_each_octave_enters_one_hidden_layer_and_the_last_layer_gets_none():
+    sampler = Sampler(FAST, generator())
+    assert len(sampler.hidden) == 5
+    assert sampler.noise_weights.shape == (4, 4, 128)
+    tables = torch.zeros(16, 64, 64, 64)
+    still = sampler(tables, flat_slice(8, torch.device("cpu"))[None])
+    assert torch.allclose(still, still[:, :1].expand_as(still))  # without noise, one constant colour
+
+
+def test_equalized_layers_start_at_unit_variance():
+    sampler = Sampler(preset("fast", width=512), generator())
+    x = torch.randn(1000, 512, generator=generator())
+    out = F.leaky_relu(sampler.hidden[0](x), 0.2)
+    assert out.pow(2).mean().item() == pytest.approx(1, abs=0.1)
+
+
+def test_octaves_of_the_paper_double_and_those_of_fast_stay_in_band():
+    assert Sampler(PAPER, generator()).octave_scale.flatten().tolist()[::3] == [2.0**i for i in range(16)]
+    assert Sampler(FAST, generator()).octave_scale.max().item() == pytest.approx(2**7)
+
+
+def test_the_grain_starts_long_along_its_axis():
+    scale = Sampler(preset("fast", grain="x", grain_ratio=0.125), generator()).octave_scale
+    assert (scale[:, 0, 0] / scale[:, 0, 1]).tolist() == [0.125] * 16
+
+
+def test_penalty_is_zero_for_a_critic_of_slope_one():
+    class Slope(torch.nn.Module):
+        def forward(self, images):
+            return images.flatten(1).sum(1, keepdim=True) / images[0].numel() ** 0.5, []
+
+    patches = torch.rand(2, 3, 16, 16, generator=generator())
+    assert gradient_penalty(Slope(), patches, patches.flip(0), generator()).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_gram_matrix_is_the_mean_product_of_channels():
+    activations = torch.randn(2, 5, 4, 6, generator=generator())
+    expected = torch.einsum("bihw,bjhw->bij", activations, activations) / 24
+    torch.testing.assert_close(gram_matrix(activations, pooled=False), expected)
+    torch.testing.assert_close(gram_matrix(activations, pooled=True), expected.mean(0))
+
+
+def test_style_loss_ignores_where_things_are():
+    activations = torch.randn(2, 5, 8, 8, generator=generator())
+    assert style_loss([activations], [activations.roll(3, -1)], pooled=True).item() == pytest.approx(0, abs=1e-6)
+    assert style_loss([activations], [activations * 1.5], pooled=True).item() > 0.1
+
+
+@pytest.mark.parametrize("rotations", ["uniform", "euler"])
+def test_slices_are_rotated_rigidly(rotations):
+    turned = draw_rotations(preset("fast", batch=64, rotations=rotations), generator())
+    torch.testing.assert_close(turned @ turned.transpose(1, 2), torch.eye(3).expand(64, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(turned), torch.ones(64))
+
+
+def test_uniform_rotations_favour_no_direction():
+    normals = draw_rotations(preset("fast", batch=4000), generator())[:, :, 2]
+    assert normals.mean(0).abs().max() < 0.05
+    assert (normals.T @ normals / 4000 - torch.eye(3) / 3).abs().max() < 0.03
+
+
+def test_slices_of_a_grained_material_all_hold_the_grain():
+    points = draw_slices(preset("fast", grain="x", batch=8), generator()).reshape(8, 64, 64, 3)
+    along = points[:, :, 1:] - points[:, :, :-1]
+    torch.testing.assert_close(along, torch.tensor([1 / 64, 0, 0]).expand_as(along), atol=1e-5, rtol=0)
+
+
+def test_a_quarter_turn_about_x_takes_y_to_z():
+    turned = about_axis(0, torch.tensor([np.pi / 2], dtype=torch.float32))[0] @ torch.tensor([0.0, 1.0, 0.0])
+    torch.testing.assert_close(turned, torch.tensor([0.0, 0.0, 1.0]), atol=1e-6, rtol=0)
+
+
+def test_rates_halve_down_to_their_floor_and_the_paper_s_are_constant():
+    assert rate(2e-3, 4e-4, 400, 400) == pytest.approx(1e-3)
+    assert rate(2e-3, 4e-4, 400, 10_000) == 4e-4
+    assert rate(PAPER.sampler_rate, PAPER.sampler_rate_floor, PAPER.sampler_half_life, 90_000) == 5e-4
+
+
+def test_the_paper_preset_is_the_paper_s():
+    expected = {
+        "octaves": 16, "width": 128, "resolution": 64, "octave_span": 15.0, "orthogonal_start": False,
+        "patch": 128, "batch": 16, "rotations": "euler", "transposed": False, "pooled_gram": False,
+        "alpha": 0.1, "beta": 1.0, "penalty": 10.0, "penalty_every": 1, "drift": 0.001,
+        "critic_rate": 2e-3, "sampler_rate": 5e-4,
+    }  # fmt: skip
+    assert {name: getattr(PAPER, name) for name in expected} == expected

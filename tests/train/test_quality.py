@@ -1,0 +1,52 @@
+"""The measures tell a texture from its exemplar, and the exemplar from nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip(
+    "stlpips_pytorch", reason="the VGG-16 weights come with stlpips-pytorch: pip install 'solidgrain[evaluate]'"
+)
+
+from solidgrain.train.quality import evaluate
+from tests.train.conftest import blotches
+
+EXEMPLAR = blotches(128, 128)
+
+
+def resampled(points, seed):
+    """Slices cut from more of the exemplar's own material: as good as it gets, in any orientation."""
+    size = round(len(points) ** 0.5)
+    draw = np.random.default_rng(seed)
+    top, left = draw.integers(0, 128 - size, 2)
+    return EXEMPLAR[top : top + size, left : left + size].reshape(-1, 3)
+
+
+def test_crops_of_the_exemplar_score_about_one():
+    evaluation = evaluate(EXEMPLAR, resampled, slices=4)
+    assert evaluation.crop == 64
+    for name in ("gram", "patches", "color"):
+        assert 0.4 < evaluation.axis[name][0] < 1.6
+
+
+def test_white_noise_scores_far_above_one():
+    evaluation = evaluate(
+        EXEMPLAR, lambda points, seed: np.random.default_rng(seed).random((len(points), 3), np.float32), slices=2
+    )
+    assert evaluation.axis["vgg_frechet"][0] > 5
+    assert evaluation.oblique["gram"][0] > 1.5
+
+
+def test_a_grain_limits_the_orientations(monkeypatch):
+    seen = []
+
+    def sample(points, seed):
+        size = round(len(points) ** 0.5)
+        seen.append(points.reshape(size, size, 3))
+        return resampled(points, seed)
+
+    evaluate(EXEMPLAR, sample, slices=3, grain="x")
+    for points in seen:
+        along = points[:, 1:] - points[:, :-1]
+        np.testing.assert_allclose(along, np.broadcast_to([1.0, 0, 0], along.shape), atol=1e-4)

@@ -1,0 +1,264 @@
+"""Training goes on where it stopped, to the last bit; what it leaves behind can be exported and says where it came from."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+
+from solidgrain.export.from_run import check_agreement, export_run, sampler_weights
+from solidgrain.runtime import BundleError, TrainingError, load
+from solidgrain.train.exemplar import read_exemplar
+from solidgrain.train.loop import Budget, train
+from solidgrain.train.run import create_run, open_run
+from solidgrain.train.sampler import Sampler
+from solidgrain.train.settings import preset
+
+TINY = {
+    "octaves": 4,
+    "width": 32,
+    "patch": 32,
+    "batch": 2,
+    "checkpoint_every": 4,
+    "sample_every": 4,
+    "report_every": 1,
+    "precision": "float32",
+}
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def new_run(folder, photograph, **changes):
+    settings = preset("fast", **{**TINY, **changes})
+    return create_run(folder, settings, read_exemplar(photograph, settings.patch), photograph.name, "CC0-1.0", "nobody")
+
+
+def losses(folder):
+    """The statistics without the clock."""
+    lines = [json.loads(line) for line in (folder / "stats.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in line.items() if name != "seconds"} for line in lines]
+
+
+def tensors(state, prefix=""):
+    for name, value in state.items():
+        if isinstance(value, dict):
+            yield from tensors(value, f"{prefix}{name}.")
+        elif isinstance(value, torch.Tensor):
+            yield f"{prefix}{name}", value
+
+
+def assert_same_checkpoint(first, second):
+    a, b = dict(tensors(open_run(first).load_checkpoint())), dict(tensors(open_run(second).load_checkpoint()))
+    assert a.keys() == b.keys()
+    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, photograph):
+    """Ten iterations in one go."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    train(new_run(folder, photograph), Budget(iterations=10), CPU)
+    return folder
+
+
+def test_a_run_stopped_and_resumed_is_the_uninterrupted_one(whole, tmp_path, photograph):
+    folder = tmp_path / "parts"
+    train(new_run(folder, photograph), Budget(iterations=3), CPU)
+    train(open_run(folder), Budget(iterations=7), CPU)
+    train(open_run(folder), Budget(iterations=10), CPU)
+    assert losses(folder) == losses(whole)
+    assert_same_checkpoint(folder, whole)
+
+
+def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, photograph):
+    """Signal 9 in the middle, after the first checkpoint: statistics past it are rewound and written again."""
+    folder = tmp_path / "killed"
+    new_run(folder, photograph)
+    command = [
+        sys.executable,
+        "-m",
+        "solidgrain.bake.cli",
+        "train",
+        "--resume",
+        str(folder),
+        "--threads",
+        "1",
+        "--iterations",
+        "10000",
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (folder / "checkpoint.pt").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(0.3)
+    process.kill()
+    process.wait()
+    further = Budget(iterations=open_run(folder).load_checkpoint()["iteration"] + 3)
+    train(open_run(folder), further, CPU)
+    train(new_run(tmp_path / "whole", photograph), further, CPU)
+    assert losses(folder) == losses(tmp_path / "whole")
+    assert_same_checkpoint(folder, tmp_path / "whole")
+
+
+def test_half_a_line_of_statistics_is_dropped_on_resume(tmp_path, photograph):
+    folder = tmp_path / "run"
+    train(new_run(folder, photograph), Budget(iterations=4), CPU)
+    with open(folder / "stats.jsonl", "a") as file:
+        file.write('{"iteration": 5, "sec')
+    train(open_run(folder), Budget(iterations=5), CPU)
+    assert [line["iteration"] for line in losses(folder)] == [1, 2, 3, 4, 5]
+
+
+def test_a_run_leaves_samples_with_the_exemplar_an_axis_slice_and_an_oblique_one(whole, photograph):
+    names = sorted(path.name for path in (whole / "samples").iterdir())
+    assert names == ["000004.png", "000008.png", "000010.png"]
+    picture = oiio.ImageBuf(os.fspath(whole / "samples" / names[-1])).get_pixels(oiio.FLOAT)
+    assert picture.shape == (256, 768, 3)
+    np.testing.assert_allclose(picture[:80, :96], read_exemplar(photograph, 64), atol=1 / 255)
+    assert np.abs(picture[:, 256:512] - picture[:, 512:]).mean() > 0.005
+
+
+def test_training_learns_the_colours_of_the_exemplar(tmp_path, photograph):
+    wanted = read_exemplar(photograph, 64).mean((0, 1))
+    run, errors = new_run(tmp_path / "run", photograph, average_decay=0.9), []
+    for iterations in (1, 80):
+        train(run, Budget(iterations=iterations), CPU)
+        texture = load(export_run(run.folder, tmp_path / f"after-{iterations}"))
+        errors.append(np.abs(texture.grid((1, 64, 64)).mean((0, 1, 2)) - wanted).max())
+    assert errors[1] < errors[0] / 2
+
+
+@pytest.mark.parametrize(("name", "span"), [("fast", 7.0), ("paper", 15.0)])
+def test_torch_and_onnx_runtime_agree_near_and_far(name, span):
+    sampler = Sampler(preset(name), torch.Generator().manual_seed(1))
+    assert check_agreement(sampler, sampler_weights(sampler)) <= 1e-4
+
+
+def test_an_exported_bundle_says_where_it_came_from(whole, tmp_path):
+    bundle = load(export_run(whole, tmp_path / "blotches")).bundle
+    training = bundle.manifest["training"]
+    assert training["iterations"] == 10
+    assert training["exemplars"][0]["exemplar"] == "blotches.png"
+    assert training["exemplars"][0]["license"] == "CC0-1.0"
+    assert training["settings"]["patch"] == 32
+    assert bundle.manifest["opset"] == 17
+    assert "CC0-1.0" in (bundle.folder / "card.md").read_text()
+
+
+def test_export_refuses_what_is_no_finished_run(whole, tmp_path, photograph, solidgrain):
+    new_run(tmp_path / "fresh", photograph)
+    with pytest.raises(TrainingError, match="no checkpoint yet"):
+        export_run(tmp_path / "fresh", tmp_path / "a")
+    assert "not a run directory" in solidgrain("export", tmp_path, "--out", tmp_path / "a").error
+    with pytest.raises(BundleError, match="already exists"):
+        export_run(whole, tmp_path / "fresh")
+    (tmp_path / "fresh" / "checkpoint.pt").write_bytes(b"hello")
+    assert "damaged checkpoint" in solidgrain("export", tmp_path / "fresh", "--out", tmp_path / "a").error
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_diverging_run_says_so_and_keeps_its_last_checkpoint(tmp_path, photograph):
+    folder = tmp_path / "run"
+    train(new_run(folder, photograph), Budget(iterations=4), CPU)
+    before = (folder / "checkpoint.pt").read_bytes()
+    run = open_run(folder)
+    run.exemplar[:] = np.nan
+    with pytest.raises(TrainingError, match="diverged at iteration 5"):
+        train(run, Budget(iterations=8), CPU)
+    assert (folder / "checkpoint.pt").read_bytes() == before
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, photograph):
+    folder = tmp_path / "run"
+    new_run(folder, photograph)
+    command = [
+        sys.executable,
+        "-m",
+        "solidgrain.bake.cli",
+        "train",
+        "--resume",
+        str(folder),
+        "--threads",
+        "1",
+        "--iterations",
+        "10000",
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not (folder / "stats.jsonl").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"solidgrain train --resume {folder}" in err
+    done = open_run(folder).load_checkpoint()["iteration"]
+    assert losses(folder)[-1]["iteration"] == done
+
+
+def test_the_command_line_trains_and_exports(solidgrain, tmp_path, photograph):
+    outcome = solidgrain(
+        "train", photograph, "--out", tmp_path / "run", "--iterations", 2, "--patch", 32, "--batch", 1, "--threads", 1,
+        "--license", "CC0-1.0", "--credit", "nobody",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.err
+    assert "solidgrain export" in outcome.err
+    assert solidgrain("export", tmp_path / "run", "--out", tmp_path / "bundle").code == 0
+    assert solidgrain("bake", tmp_path / "bundle", "--size", 4, "--out", tmp_path / "a.npy").code == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "message"),
+    [
+        (["--iterations", "0"], 1, "--iterations 0"),
+        (["--minutes", "-1"], 1, "--minutes"),
+        (["--minutes", "nan"], 1, "--minutes"),
+        (["--patch", "8"], 1, "--patch 8"),
+        (["--patch", "81"], 1, "expected at least 81x81"),
+        (["--batch", "0"], 1, "--batch 0"),
+        (["--preset", "slow"], 2, "--preset"),
+        (["--anisotropic", "z"], 2, "--anisotropic"),
+    ],
+)
+def test_flags_that_make_no_sense_are_refused_in_one_line(solidgrain, tmp_path, photograph, flags, code, message):
+    outcome = solidgrain("train", photograph, "--out", tmp_path / "run", *flags)
+    assert outcome.code == code
+    assert message in outcome.error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_cuda_without_a_device_is_an_error_not_a_fall_back(solidgrain, tmp_path, photograph):
+    outcome = solidgrain("train", photograph, "--out", tmp_path / "run", "--device", "cuda")
+    assert outcome.code == 1
+    assert "sees no CUDA device" in outcome.error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_run_is_not_overwritten(solidgrain, whole, photograph):
+    before = (whole / "options.json").read_bytes()
+    outcome = solidgrain("train", photograph, "--out", whole)
+    assert outcome.code == 1
+    assert "--resume" in outcome.error
+    assert (whole / "options.json").read_bytes() == before
+
+
+def test_a_gradient_gets_a_warning_that_names_the_figure(solidgrain, tmp_path):
+    ramp = np.linspace(0, 1, 96, dtype=np.float32)[:, None, None] * np.ones((96, 96, 3), np.float32)
+    oiio.ImageBuf(ramp).write(os.fspath(tmp_path / "ramp.png"), oiio.UINT8)
+    outcome = solidgrain(
+        "train", tmp_path / "ramp.png", "--out", tmp_path / "run", "--iterations", 1, "--patch", 32, "--batch", 1
+    )
+    assert "nonstationarity 0.9" in outcome.err
