@@ -50,7 +50,7 @@ class Settings:
     sampler_rate: float = 2e-3
     sampler_rate_floor: float = 4e-4
     sampler_half_life: float = 400.0
-    average_decay: float = 0.995  # of the exponential moving average whose weights are all output
+    average_decay: float = 0.999  # at most, of the exponential moving average whose weights are all output
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
     # Reporting

@@ -74,7 +74,7 @@ class FileWriter(Writer):
     def __init__(self, output: Output, volume: Volume) -> None:
         super().__init__(output, volume)
         self.temporary = temporary_name(output.path)
-        self.file: BinaryIO = open(self.temporary, "wb")  # noqa: SIM115: closed by commit or abort
+        self.file: BinaryIO = open(self.temporary, "wb")  # noqa: SIM115
 
     def commit(self) -> Sequence[Path]:
         self.file.flush()
