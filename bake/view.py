@@ -109,11 +109,18 @@ def _add(plotter: Any, image: pyvista.ImageData, mode: str, interactive: bool) -
         plotter.add_volume(image, scalars="rgba", opacity_unit_distance=4 * max(image.spacing))
     elif mode == "threshold":
         image.point_data["luma"] = luma(image)
+        middle = float(np.median(image.point_data["luma"]))
+
+        def keep_brighter(level: float) -> None:
+            kept = image.threshold(level, scalars="luma", all_scalars=True)
+            if kept.n_cells:
+                plotter.add_mesh(kept, scalars="rgb", rgb=True, name="kept", reset_camera=False)
+            else:
+                plotter.remove_actor("kept")
+
+        keep_brighter(middle)
         if interactive:
-            plotter.add_mesh_threshold(image, scalars="luma", show_scalar_bar=False)
-        else:
-            bright = image.threshold(float(np.median(image.point_data["luma"])), scalars="luma", all_scalars=True)
-            plotter.add_mesh(bright, scalars="rgb", rgb=True)
+            plotter.add_slider_widget(keep_brighter, rng=(0, 255), value=middle, title="luma", color="white")
     else:
         plotter.add_mesh(image.extract_surface(algorithm="dataset_surface"), scalars="rgb", rgb=True)
 

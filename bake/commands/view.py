@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 from pathlib import Path
 
 MODES = ("slices", "volume", "threshold", "block")
@@ -18,5 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.view import show
 
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)  # VTK's event loop never returns to Python's own handlers
     show(arguments.file, arguments.mode, arguments.screenshot)
     return 0
