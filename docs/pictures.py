@@ -1,6 +1,6 @@
 """The README's picture: the exemplar, an axis-aligned and an oblique slice at the same scale, and a carved solid.
 
-    make pictures     needs the exemplar beside the checkout, or --exemplar PHOTO
+make pictures     needs the exemplar beside the checkout, or --exemplar PHOTO
 """
 
 from __future__ import annotations
