@@ -83,6 +83,16 @@ def test_a_run_stopped_and_resumed_is_the_uninterrupted_one(whole, tmp_path, pho
     assert_same_checkpoint(folder, whole)
 
 
+def test_resuming_is_exact_in_bfloat16_and_on_two_threads_as_well(tmp_path, photograph):
+    torch.set_num_threads(2)
+    for name, parts in (("whole", [5]), ("parts", [2, 5])):
+        new_run(tmp_path / name, photograph, precision="bfloat16")
+        for iterations in parts:
+            train(open_run(tmp_path / name), Budget(iterations=iterations), CPU)
+    assert losses(tmp_path / "parts") == losses(tmp_path / "whole")
+    assert_same_checkpoint(tmp_path / "parts", tmp_path / "whole")
+
+
 def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, photograph):
     """Signal 9 in the middle, after the first checkpoint: statistics past it are rewound and written again."""
     folder = tmp_path / "killed"
