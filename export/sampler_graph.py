@@ -114,6 +114,7 @@ def _lattice_texels(cells: Triple, lattice: Var, octaves: int) -> list[Var]:
     """
     entries = op.reshape(lattice, op.const([octaves, 9]))
     basis = [[op.gather(entries, op.const([3 * row + column]), axis=1) for column in range(3)] for row in range(3)]
+    cells = _canonical(cells, basis)
 
     def corners(cell: Triple, axis: int, count: Var | None) -> list[Var]:
         if axis == 3 and count is not None:
@@ -128,8 +129,19 @@ def _lattice_texels(cells: Triple, lattice: Var, octaves: int) -> list[Var]:
     return corners(cells, 0, None)
 
 
+def _canonical(cells: Triple, basis: Sequence[Triple]) -> Triple:
+    """The cells' canonical representatives, in 64-bit integers: the products outgrow float64 for tiles above 256 voxels."""
+    whole = [op.cast(cell, to=np.int64) for cell in cells]
+    columns = [[op.cast(entry, to=np.int64) for entry in row] for row in basis]
+    for axis in range(3):
+        rest = op.mod(whole[axis], columns[axis][axis])  # the sign of the divisor: a floor division's remainder
+        turns = op.div(op.sub(whole[axis], rest), columns[axis][axis])
+        whole = [*whole[:axis], *(op.sub(whole[row], op.mul(turns, columns[row][axis])) for row in range(axis, 3))]
+    return [op.cast(cell, to=np.float64) for cell in whole]
+
+
 def _reduce(cell: Triple, basis: Sequence[Triple], axis: int) -> Triple:
-    """One step towards the canonical representative of a cell modulo its octave's lattice.
+    """One step towards the canonical representative of a cell modulo its octave's lattice, for cells that are near it.
 
     The basis is lower triangular: column k has its pivot in row k and zeros above, so one floor division per axis, in
     order, is the whole reduction.

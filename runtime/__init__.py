@@ -21,6 +21,7 @@ from solidgrain.runtime.errors import (
     ProviderError,
     SolidgrainError,
     TrainingError,
+    UsageError,
     ViewError,
 )
 from solidgrain.runtime.texture import Texture, load
@@ -34,6 +35,7 @@ __all__ = [
     "SolidgrainError",
     "Texture",
     "TrainingError",
+    "UsageError",
     "ViewError",
     "embedded_names",
     "load",

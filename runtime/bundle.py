@@ -22,6 +22,19 @@ from solidgrain.runtime.errors import BundleError
 
 MANIFEST, SAMPLER, TEXTURE, CARD = "manifest.json", "sampler.onnx", "texture.sgt.npz", "card.md"
 FORMAT, FORMAT_VERSION = "solidgrain-bundle", 1
+KEYS: dict[str, type] = {
+    "name": str,
+    "producer": str,
+    "opset": int,
+    "octaves": int,
+    "width": int,
+    "hidden_layers": int,
+    "patch": int,
+    "color_encoding": str,
+    "files": dict,
+    "probe": dict,
+    "training": dict,
+}
 
 
 @dataclass(frozen=True)
@@ -71,9 +84,13 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise BundleError(
             f"{path}: format version {version}, this solidgrain reads {FORMAT_VERSION}; export again or update solidgrain"
         )
-    missing = [key for key in ("name", "octaves", "width", "hidden_layers", "files", "probe") if key not in manifest]
-    if missing or SAMPLER not in manifest["files"]:
-        raise BundleError(f"{path}: incomplete manifest (missing {', '.join(missing) or SAMPLER}); export the bundle again")
+    wrong = [key for key, kind in KEYS.items() if not isinstance(manifest.get(key), kind)]
+    if not wrong and not all(isinstance(digest, str) for digest in manifest["files"].values()):
+        wrong = ["files"]
+    if not wrong and not {"seed", "points", "rgb"} <= manifest["probe"].keys():
+        wrong = ["probe"]
+    if wrong or SAMPLER not in manifest["files"]:
+        raise BundleError(f"{path}: incomplete manifest (check {', '.join(wrong) or SAMPLER}); export the bundle again")
     return dict(manifest)
 
 

@@ -1,6 +1,7 @@
 """The errors that solidgrain raises for what a user can mend.
 
     SolidgrainError
+      UsageError        flags that contradict each other or name what does not exist (exit code 2)
       BundleError       a bundle or texture file that is missing, damaged or of another version
       ExemplarError     a photograph that cannot be learned from
       TrainingError     a training run that cannot start, go on or be read
@@ -17,6 +18,10 @@ from __future__ import annotations
 
 class SolidgrainError(Exception):
     """Base of all errors that solidgrain raises on purpose."""
+
+
+class UsageError(SolidgrainError):
+    """The command line asks for something that no file or machine could make possible."""
 
 
 class BundleError(SolidgrainError):

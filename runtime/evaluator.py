@@ -55,7 +55,10 @@ class Instance:
         import onnxruntime
 
         feed = {**self.inputs, "points": onnxruntime.OrtValue.ortvalue_from_numpy(points)}
-        rgb: FloatArray = self.session.run_with_ort_values(["rgb"], feed)[0].numpy()
+        try:
+            rgb: FloatArray = self.session.run_with_ort_values(["rgb"], feed)[0].numpy()
+        except Exception as error:  # ONNX Runtime raises types of its own, without a common base
+            raise EvaluationError(f"{self.name}: ONNX Runtime failed ({str(error).strip().splitlines()[0]})") from error
         if not np.isfinite(rgb).all():
             x, y, z = points[np.flatnonzero(~np.isfinite(rgb).all(axis=1))[0]]
             raise EvaluationError(f"{self.name}: the sampler returned NaN at ({x:g}, {y:g}, {z:g}); the texture is damaged")

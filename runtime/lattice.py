@@ -21,6 +21,8 @@ import numpy.typing as npt
 from solidgrain.runtime.errors import EvaluationError
 from solidgrain.runtime.noise import RESOLUTION
 
+EXACT = 2.0**61  # products of cells and basis entries stay below it
+
 DoubleArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
@@ -33,6 +35,16 @@ class Tiling:
     lattice: DoubleArray  # [n, 3, 3], lower-triangular, whole numbers
     distortion: DoubleArray  # [n], |T' - T| / |T|
     period: tuple[float, float, float]  # (x, y, z) in exemplar pixels; 0 along axes that do not tile
+
+    def check_exact(self, farthest: tuple[float, float, float]) -> None:
+        """Raises EvaluationError if cells within `farthest` (x, y, z) pixels cannot be reduced in 64-bit integers."""
+        reach = np.array([self.period[k] or abs(farthest[k]) for k in range(3)])
+        cells = (np.abs(self.transforms) @ reach).max(1) + 2
+        if any(self.period) and (cells * self.lattice.max((1, 2))).max() >= EXACT:
+            raise EvaluationError(
+                f"tile period {self.period} at up to {farthest} pixels: too large for an exact seam; "
+                "use a shorter period, or stay nearer to the origin along the axes that do not tile"
+            )
 
     def wrap(self, coordinates: DoubleArray, axis: int) -> DoubleArray:
         """Coordinates along one axis, brought into the first tile."""
@@ -101,7 +113,7 @@ def lattice_basis(columns: IntArray) -> DoubleArray:
     period of their own, as long as the table has texels for, and 64 at least.
     """
     left = [[int(entry) for entry in column] for column in columns.T]
-    basis = np.zeros((3, 3))
+    basis = [[0, 0, 0] for _ in range(3)]  # columns, in Python integers: intermediate entries outgrow 64 bits
     for row in range(3):
         while len(pivots := [column for column in left if column[row]]) > 1:
             smallest = min(pivots, key=lambda column: abs(column[row]))
@@ -112,10 +124,13 @@ def lattice_basis(columns: IntArray) -> DoubleArray:
         if pivots:
             pivot = pivots[0]
             left = [column for column in left if column is not pivot]
-            basis[:, row] = np.array(pivot) * (1 if pivot[row] > 0 else -1)
-    free = [row for row in range(3) if basis[row, row] == 0]
-    if free:
-        cells = math.prod(basis[row, row] for row in range(3) if row not in free)
-        length = max(RESOLUTION, int((RESOLUTION**3 / cells) ** (1 / len(free))))
-        basis[free, free] = length
-    return basis
+            basis[row] = pivot if pivot[row] > 0 else [-entry for entry in pivot]
+    free = [row for row in range(3) if basis[row][row] == 0]
+    cells = math.prod(basis[row][row] for row in range(3) if row not in free)
+    for row in free:
+        basis[row][row] = max(RESOLUTION, int((RESOLUTION**3 / cells) ** (1 / len(free))))
+    for row in (1, 2):  # entries left of a pivot become smaller than it
+        for column in basis[:row]:
+            turns = column[row] // basis[row][row]
+            column[:] = [a - turns * b for a, b in zip(column, basis[row], strict=True)]
+    return np.array(basis, np.float64).T

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from solidgrain.runtime.errors import BundleError, ProviderError
+from solidgrain.runtime.noise import RESOLUTION
+from solidgrain.runtime.texture_file import TextureData
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -25,6 +27,18 @@ def available_providers() -> list[str]:
 def usable_threads() -> int:
     """How many processors this process may use: its affinity mask, not the machine's count."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_inputs(session: onnxruntime.InferenceSession, texture: TextureData, path: Path) -> None:
+    """Raises BundleError if a graph does not take a texture of these shapes."""
+    found = {node.name: list(node.shape) for node in session.get_inputs()}
+    octaves = len(texture.transforms)
+    expected = {name: list(array.shape) for name, array in texture.arrays().items()}
+    expected |= {"offsets": [octaves, 3], "lattice": [octaves, 3, 3], "noise": [octaves, *[RESOLUTION] * 3]}
+    wrong = [name for name, shape in expected.items() if found.get(name) != shape]
+    if wrong or "points" not in found or [node.name for node in session.get_outputs()] != ["rgb"]:
+        named = wrong[0] if wrong else "points or rgb"
+        raise BundleError(f"{path}: not a sampler for this texture ({named} is {found.get(named)}); export the bundle again")
 
 
 def open_session(path: Path, provider: str) -> onnxruntime.InferenceSession:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -12,10 +13,19 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.runtime import evaluator
-from solidgrain.runtime.bundle import SAMPLER, TEXTURE, Bundle, embedded_folder, find_bundle, open_bundle
+from solidgrain.runtime.bundle import (
+    MANIFEST,
+    SAMPLER,
+    TEXTURE,
+    Bundle,
+    embedded_folder,
+    embedded_names,
+    find_bundle,
+    open_bundle,
+)
 from solidgrain.runtime.errors import BundleError, EvaluationError
 from solidgrain.runtime.lattice import Tiling, tiled, untiled
-from solidgrain.runtime.provider import open_session, usable_threads
+from solidgrain.runtime.provider import check_inputs, open_session, usable_threads
 from solidgrain.runtime.texture_file import TextureData, read_texture, write_texture
 
 if TYPE_CHECKING:
@@ -26,6 +36,7 @@ Vector = tuple[float, float, float]
 
 DEFAULT_TEXTURE = "granite"
 SLAB = 16  # slices per slab
+FARTHEST = 2.0**40  # exemplar pixels: a float64 still tells 4096 places within a pixel there
 
 
 def load(
@@ -42,12 +53,15 @@ def load(
     uses every processor that this process may use. Raises BundleError or ProviderError.
     """
     data, owner = _resolve(os.fspath(source), None if bundle is None else Path(bundle))
-    return Texture(data, owner, open_session(owner.folder / SAMPLER, provider), threads or usable_threads())
+    (count,) = _whole("threads", (threads,), count=1, least=0)
+    session = open_session(owner.folder / SAMPLER, provider)
+    check_inputs(session, data, owner.folder / SAMPLER)
+    return Texture(data, owner, session, count or usable_threads())
 
 
 def _resolve(source: str, bundle: Path | None) -> tuple[TextureData, Bundle]:
     path = Path(source)
-    if path.is_dir():
+    if path.is_dir() and ((path / MANIFEST).is_file() or source not in embedded_names()):
         owner = open_bundle(path)
         if not (path / TEXTURE).is_file():
             raise BundleError(f"{path / TEXTURE}: missing; this bundle holds no texture of its own")
@@ -93,6 +107,7 @@ class Texture:
     def __init__(self, data: TextureData, bundle: Bundle, session: onnxruntime.InferenceSession, threads: int) -> None:
         self.data, self.bundle, self.threads = data, bundle, threads
         self._session = session
+        self._last: tuple[object, evaluator.Instance] | None = None
 
     @property
     def name(self) -> str:
@@ -113,11 +128,14 @@ class Texture:
 
         Raises EvaluationError for points of another shape or that are not finite.
         """
-        coordinates = np.asarray(points, np.float64)
+        try:
+            coordinates = np.asarray(points, np.float64)
+        except (TypeError, ValueError) as error:
+            raise EvaluationError(f"points are not numbers ({error}), expected [P, 3] (x, y, z)") from error
         if coordinates.ndim != 2 or coordinates.shape[1] != 3:
             raise EvaluationError(f"points have shape {coordinates.shape}, expected [P, 3] (x, y, z)")
-        if not np.isfinite(coordinates).all():
-            raise EvaluationError("points hold NaN or infinity, expected finite coordinates")
+        if not (np.abs(coordinates) <= FARTHEST).all():
+            raise EvaluationError(f"points hold NaN or infinity, or lie beyond {FARTHEST:g}; expected finite exemplar pixels")
         return evaluator.evaluate_points(self._instance(untiled(self.transforms), seed), coordinates, self.threads)
 
     def grid(
@@ -158,9 +176,14 @@ class Texture:
         Memory is bounded by the slab, whatever the depth. Arguments and errors as in `grid`.
         """
         depth, rows, columns = _positive("shape", shape)
-        (thickness,) = _positive("slab", (slab,), count=1)
+        (thickness,) = _whole("slab", (slab,), count=1, least=1)
         start, step = _finite("origin", origin), _spacing(spacing)
         tiling = self.tiling(shape, spacing=spacing, tile=tile, period=period)
+        ends = [start[axis] + step[axis] * count for axis, count in enumerate((columns, rows, depth))]
+        farthest = [max(abs(first), abs(last)) for first, last in zip(start, ends, strict=True)]
+        if max(farthest) > FARTHEST:
+            raise EvaluationError(f"grid reaches {max(farthest):g} pixels from the origin, expected at most {FARTHEST:g}")
+        tiling.check_exact((farthest[0], farthest[1], farthest[2]))
         instance = self._instance(tiling, seed)
         x, y, z = (
             tiling.wrap(start[axis] + (np.arange(count, dtype=np.float64) + 0.5) * step[axis], axis)
@@ -189,25 +212,43 @@ class Texture:
         write_texture(Path(path), self.data)
 
     def _instance(self, tiling: Tiling, seed: int) -> evaluator.Instance:
-        return evaluator.Instance(self._session, self.data, tiling, seed)
+        """The instance of a seed; the last one is kept, so that point after point is cheap."""
+        try:
+            number = operator.index(seed)
+        except TypeError as error:
+            raise EvaluationError(f"seed {seed!r}: expected a whole number from 0 to 2^64 - 1") from error
+        key = (number, tiling.transforms.tobytes(), tiling.lattice.tobytes())
+        if self._last is None or self._last[0] != key:
+            self._last = (key, evaluator.Instance(self._session, self.data, tiling, number))
+        return self._last[1]
 
 
-def _positive(name: str, values: Sequence[int], count: int = 3) -> tuple[int, ...]:
-    numbers = tuple(values)
-    if len(numbers) != count or any(int(number) != number or number < 1 for number in numbers):
-        raise EvaluationError(f"{name} {numbers}: expected {count} whole number{'s' * (count > 1)} above 0")
-    return tuple(int(number) for number in numbers)
+def _positive(name: str, values: Sequence[int]) -> tuple[int, ...]:
+    return _whole(name, values, count=3, least=1)
+
+
+def _whole(name: str, values: Sequence[int], count: int, least: int) -> tuple[int, ...]:
+    try:
+        numbers = tuple(operator.index(value) for value in values)
+    except TypeError:
+        numbers = ()
+    if len(numbers) != count or min(numbers) < least:
+        raise EvaluationError(f"{name} {values}: expected {count} whole number{'s' * (count > 1)} of at least {least}")
+    return numbers
 
 
 def _finite(name: str, values: Sequence[float]) -> Vector:
-    numbers = tuple(float(value) for value in values)
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError):
+        numbers = ()
     if len(numbers) != 3 or not np.isfinite(numbers).all():
-        raise EvaluationError(f"{name} {numbers}: expected three finite numbers (x, y, z)")
+        raise EvaluationError(f"{name} {values}: expected three finite numbers (x, y, z)")
     return (numbers[0], numbers[1], numbers[2])
 
 
 def _spacing(spacing: float | Sequence[float]) -> Vector:
-    step = _finite("spacing", (spacing,) * 3 if isinstance(spacing, (int, float)) else spacing)
+    step = _finite("spacing", (spacing,) * 3 if np.ndim(spacing) == 0 else spacing)  # type: ignore[arg-type]
     if min(step) <= 0:
         raise EvaluationError(f"spacing {step}: expected more than 0 exemplar pixels per voxel")
     return step

@@ -1,6 +1,6 @@
 """Texture files, `*.sgt.npz`: everything that the sampler needs besides its shared weights, about 25 KB.
 
-An uncompressed-name, deflated NumPy archive: `transforms` [n, 3, 3] float64 in texels per exemplar pixel, `gamma` and
+A NumPy archive: `transforms` [n, 3, 3] float64 in texels per exemplar pixel, `gamma` and
 `delta` [hidden layers, width], `noise_weights` [4, n/4, width] float32, and `header`, a JSON object with the format version,
 a name, and the sha256 of the sampler that the numbers belong to. Equal textures give equal bytes.
 """
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.runtime.errors import BundleError
+from solidgrain.runtime.files import replacing
 
 FORMAT, FORMAT_VERSION = "solidgrain-texture", 1
 
@@ -48,34 +49,31 @@ def write_texture(path: Path, texture: TextureData) -> None:
         "name": texture.name,
         "sampler_sha256": texture.sampler_sha256,
     }
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, array in {"header": np.array(json.dumps(header)), **texture.arrays()}.items():
                 data = io.BytesIO()
                 np.lib.format.write_array(data, np.asarray(array, order="C"), allow_pickle=False)
                 archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getvalue(), zipfile.ZIP_DEFLATED)
-        os.replace(temporary, path)
     except OSError as error:
         raise BundleError(f"{path}: cannot write the texture file ({error.strerror})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_texture(path: Path) -> TextureData:
     """Read a texture file. Raises BundleError if it is damaged, of another version, or holds values that are not finite."""
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"]))
+            header = dict(json.loads(str(archive["header"])))
             arrays = {name: archive[name] for name in ARRAYS}
+            name, sampler_sha256 = str(header.get("name", "")), str(header.get("sampler_sha256", ""))
     except OSError as error:
         raise BundleError(f"{path}: cannot read the texture file ({error})") from error
-    except (ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
-        raise BundleError(f"{path}: not a texture file, or damaged ({error}); save it again") from error
+    except (ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise BundleError(f"{path}: not a texture file, or damaged ({type(error).__name__}); save it again") from error
     if header.get("format") != FORMAT or header.get("format_version") != FORMAT_VERSION:
         found = f"{header.get('format')} version {header.get('format_version')}"
         raise BundleError(f"{path}: {found}, expected {FORMAT} version {FORMAT_VERSION}; save it again or update solidgrain")
-    for name, dtype in ARRAYS.items():
-        if arrays[name].dtype != dtype or not np.isfinite(arrays[name]).all():
-            raise BundleError(f"{path}: {name} is not finite {np.dtype(dtype)}; the file is damaged, save it again")
-    return TextureData(header["name"], header["sampler_sha256"], **arrays)
+    for key, dtype in ARRAYS.items():
+        if arrays[key].dtype != dtype or not np.isfinite(arrays[key]).all():
+            raise BundleError(f"{path}: {key} is not finite {np.dtype(dtype)}; the file is damaged, save it again")
+    return TextureData(name, sampler_sha256, **arrays)
