@@ -34,17 +34,22 @@ def bake(plan: Plan, texture: Texture, on_slice: OnSlice = lambda done, total: N
     started = time.monotonic()
     try:
         for output in plan.outputs:
-            writers.append(open_writer(output, plan.volume))
+            writers.append(open_writer(output, plan.volume, texture.threads))
         evaluation = _feed(plan, texture, writers, on_slice)
+        for writer in writers:
+            writer.finish()
         files = [path for writer in writers for path in writer.commit()]
     except OSError as error:
-        raise BakeError(
-            f"cannot write {error.filename or 'the outputs'}: {error.strerror}; free space or bake elsewhere"
-        ) from error
+        raise BakeError(f"cannot write {_culprit(error, plan)}: {error.strerror}; free space or bake elsewhere") from error
     finally:
         for writer in writers:
             writer.abort()  # nothing to do for those that have committed
     return Baked(files, time.monotonic() - started, evaluation)
+
+
+def _culprit(error: OSError, plan: Plan) -> str:
+    """The file that an error is about, or the outputs where the system does not say."""
+    return str(error.filename2 or error.filename or ", ".join(str(output.path) for output in plan.outputs))
 
 
 def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], on_slice: OnSlice) -> float:
@@ -56,5 +61,6 @@ def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], on_slice: OnS
         for writer in writers:
             writer.write(z, slab)
         on_slice(z + len(slab), volume.shape[0])
+        del slab  # or it would live while the next one is made
         waiting_since = time.monotonic()
     return evaluation

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
+import re
 import signal
 import sys
+import threading
 from collections.abc import Sequence
 from types import FrameType, ModuleType
 from typing import NoReturn
@@ -21,7 +24,7 @@ COMMANDS = {
     "doctor": ("solidgrain.bake.commands.doctor", "say what this installation can do, and what is wrong with it"),
     "train": ("solidgrain.train.command", "learn a solid texture from one photograph"),
     "export": ("solidgrain.export.command", "turn a training run into a bundle of ONNX graphs"),
-    "evaluate": ("solidgrain.bake.commands.evaluate", "measure a texture's slices against its exemplar"),
+    "evaluate": ("solidgrain.export.evaluate_command", "measure a texture's slices against its exemplar"),
 }
 EXTRAS = {
     "torch": "train",
@@ -29,6 +32,7 @@ EXTRAS = {
     "spox": "export",
     "OpenEXR": "bake",
     "OpenImageIO": "bake",
+    "stlpips_pytorch": "evaluate",
     "pyvista": "view",
     "vtkmodules": "view",
 }
@@ -44,17 +48,23 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line. Returns the exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments = _glue_negative(list(sys.argv[1:] if argv is None else argv))
     parser, module = _parser(arguments)
     options = parser.parse_args(arguments)
     if module is None:
         parser.print_help()
         return USAGE
-    from solidgrain.runtime.errors import SolidgrainError  # here: it imports numpy, which --help can do without
+    from solidgrain.runtime.errors import SolidgrainError, UsageError  # here: they import numpy, which --help can do without
 
-    signal.signal(signal.SIGTERM, _interrupt)  # farms stop jobs with SIGTERM: clean up as for Ctrl-C
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _interrupt)  # farms stop jobs with SIGTERM: clean up as for Ctrl-C
     try:
-        return int(module.run(options))
+        code = int(module.run(options))
+        sys.stdout.flush()
+        return code
+    except UsageError as error:
+        _fail(str(error))
+        return USAGE
     except SolidgrainError as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
@@ -62,6 +72,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if package not in EXTRAS:
             raise
         return _fail(f"{options.command} needs the package {package}; pip install 'solidgrain[{EXTRAS[package]}]'")
+    except OSError as error:
+        if error.filename is None:  # stdout: a closed pipe, a full device
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains once more on exit
+            return _fail(f"cannot print the result ({error.strerror})")
+        raise
     except KeyboardInterrupt:
         print("interrupted; nothing half-written was left behind", file=sys.stderr)
         return INTERRUPTED
@@ -79,6 +94,17 @@ def _parser(arguments: Sequence[str]) -> tuple[Parser, ModuleType | None]:
             module = importlib.import_module(module_name)
             module.add_arguments(command)
     return parser, module
+
+
+def _glue_negative(arguments: list[str]) -> list[str]:
+    """`--origin -1,0,0` as `--origin=-1,0,0`: argparse would take the value for a flag."""
+    glued: list[str] = []
+    for word in arguments:
+        if re.match(r"-[\d.]", word) and glued and re.fullmatch(r"--[a-z-]+", glued[-1]):
+            glued[-1] += f"={word}"
+        else:
+            glued.append(word)
+    return glued
 
 
 def _fail(message: str) -> int:

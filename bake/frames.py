@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from solidgrain.runtime.errors import BakeError
+from solidgrain.runtime.errors import UsageError
 
 PATTERN = re.compile(r"(?P<hashes>#+)|%0(?P<digits>\d+)d")
 
@@ -14,14 +14,14 @@ def frame_paths(pattern: Path, count: int, first: int) -> list[Path]:
     """The path of each of `count` frames, numbered from `first`.
 
     The padding is the pattern's, or wider for all of them when the last number needs it: players break on mixed widths.
-    Raises BakeError if the name has no frame pattern, or several, and there is more than one frame.
+    Raises UsageError if the name has no frame pattern, or several, and there is more than one frame.
     """
     matches = list(PATTERN.finditer(pattern.name))
     if not matches and count == 1:
         return [pattern]
     if len(matches) != 1:
         example = f"{pattern.stem.rstrip('.')}.####{pattern.suffix}"
-        raise BakeError(f"--out {pattern}: expected one frame pattern for its {count} slices, such as {example}")
+        raise UsageError(f"--out {pattern}: expected one frame pattern for its {count} slices, such as {example}")
     match = matches[0]
     asked = len(match["hashes"]) if match["hashes"] else int(match["digits"])
     width = max(asked, len(str(first + count - 1)))

@@ -6,12 +6,12 @@ import hashlib
 import json
 import os
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from solidgrain.bake.writers import Output, Volume, output_bytes, output_exists
-from solidgrain.runtime.errors import BakeError
+from solidgrain.bake.writers import Output, Volume, output_bytes, output_exists, output_files
+from solidgrain.runtime.errors import BakeError, UsageError
 
 SLAB_BYTES = 48 * 2**20  # of float32 colour; what a bake holds at a time is a small multiple of it
 THICKEST_SLAB = 16  # slices
@@ -54,9 +54,9 @@ class Plan:
 
     @property
     def memory(self) -> int:
-        """An upper estimate of resident bytes: the slab, its copies in the writers' formats, and the rest."""
-        width, height, _ = self.size
-        return BASE_MEMORY + 3 * self.slab * width * height * 12
+        """An upper estimate of resident bytes: the slab, what writers make of it, coordinates and file names, and the rest."""
+        width, height, depth = self.size
+        return BASE_MEMORY + 3 * self.slab * width * height * 12 + 64 * (width + height) + 1024 * depth
 
     def to_json(self) -> dict[str, Any]:
         """The plan as plain data, with the hash that names the work."""
@@ -67,13 +67,32 @@ class Plan:
 
 
 def check_plan(plan: Plan, overwrite: bool) -> None:
-    """Refuse what cannot work, before any voxel is evaluated. Raises BakeError with the reason."""
+    """Refuse what cannot work, before any voxel is evaluated. Raises BakeError or UsageError with the reason."""
     for output in plan.outputs:
         _check_folder(output.path)
-        if not overwrite and (existing := output_exists(output, plan.volume)):
-            raise BakeError(f"{existing}: already exists; use --overwrite to replace it or --no-clobber to keep it")
-    _check_memory(plan)
+    _check_memory(plan)  # before any list as long as the volume is made
     _check_disk(plan)
+    taken: set[Path] = set()
+    for output in plan.outputs:
+        for path in output_files(output, plan.volume):
+            _check_file(path, overwrite, taken)
+
+
+def without_existing(plan: Plan) -> Plan:
+    """The plan without the outputs of which a file exists (`--no-clobber`)."""
+    _check_memory(plan)
+    kept = tuple(output for output in plan.outputs if not output_exists(output, plan.volume))
+    return replace(plan, outputs=kept)
+
+
+def _check_file(path: Path, overwrite: bool, taken: set[Path]) -> None:
+    if path in taken:
+        raise UsageError(f"--out {path}: two outputs would write this file; give each a name of its own")
+    taken.add(path)
+    if path.is_dir():
+        raise BakeError(f"{path}: is a folder, expected a file name")
+    if not overwrite and path.exists():
+        raise BakeError(f"{path}: already exists; use --overwrite to replace it or --no-clobber to keep it")
 
 
 def _check_folder(path: Path) -> None:
@@ -82,8 +101,6 @@ def _check_folder(path: Path) -> None:
         raise BakeError(f"{path}: folder {folder} does not exist; create it first")
     if not os.access(folder, os.W_OK):
         raise BakeError(f"{path}: folder {folder} is not writable")
-    if path.is_dir():
-        raise BakeError(f"{path}: is a folder, expected a file name")
 
 
 def _check_memory(plan: Plan) -> None:

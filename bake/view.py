@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from solidgrain.bake.opengl import has_display, off_screen_environment, require_opengl
 from solidgrain.runtime.errors import ViewError
+from solidgrain.runtime.files import temporary_name
 
 if TYPE_CHECKING:
     import pyvista
@@ -23,10 +24,9 @@ def read_volume(path: Path) -> pyvista.ImageData:
     """
     import pyvista
 
-    if not path.is_file():
-        raise ViewError(f"{path}: no such file; expected a volume made by solidgrain bake (.vti or .npy)")
     if path.suffix.lower() == ".npy":
         return _from_array(path)
+    pyvista.vtk_verbosity("off")  # VTK prints pages about a damaged file; the error below says it in a line
     try:
         image = pyvista.read(os.fspath(path))
     except Exception as error:  # VTK's readers raise several unrelated types
@@ -47,10 +47,12 @@ def _from_array(path: Path) -> pyvista.ImageData:
 
     try:
         array = np.load(path, allow_pickle=False, mmap_mode="r")
-    except (OSError, ValueError) as error:
-        raise ViewError(f"{path}: not readable as an array ({error})") from error
-    if array.ndim != 4 or array.shape[-1] != 3:
-        raise ViewError(f"{path}: shape {array.shape}, expected [z, y, x, 3]")
+    except (OSError, ValueError, EOFError) as error:
+        raise ViewError(f"{path}: not readable as a NumPy array") from error
+    if array.ndim != 4 or array.shape[-1] != 3 or array.size == 0 or array.dtype.kind not in "fu":
+        raise ViewError(f"{path}: {array.dtype} of shape {array.shape}, expected floats or uint8, [z, y, x, 3]")
+    if not np.isfinite(array).all():
+        raise ViewError(f"{path}: holds NaN or infinity, expected colours from 0 to 1")
     image = pyvista.ImageData(dimensions=array.shape[2::-1], origin=(0.5, 0.5, 0.5))
     image.point_data["rgb"] = _bytes(array.reshape(-1, 3))
     return image
@@ -68,6 +70,8 @@ def show(path: Path, mode: str = "slices", screenshot: Path | None = None, size:
 
     Raises ViewError where there is no OpenGL library, and for a window where there is no display.
     """
+    if not path.is_file():
+        raise ViewError(f"{path}: no such file; expected a volume made by solidgrain bake (.vti or .npy)")
     if screenshot is None and not has_display():
         raise ViewError("no display to open a window on; use --screenshot FILE.png")
     if screenshot is not None and (screenshot.suffix.lower() != ".png" or not screenshot.parent.is_dir()):
@@ -85,7 +89,7 @@ def show(path: Path, mode: str = "slices", screenshot: Path | None = None, size:
     if screenshot is None:
         plotter.show(title=f"solidgrain: {path.name}")
         return
-    temporary = screenshot.with_name(f".{screenshot.stem}.{os.getpid()}.tmp.png")
+    temporary = temporary_name(screenshot)
     try:
         plotter.screenshot(os.fspath(temporary))
         os.replace(temporary, screenshot)

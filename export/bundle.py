@@ -19,6 +19,7 @@ import onnxruntime
 from solidgrain.export.sampler_graph import OPSET, build_sampler_graph
 from solidgrain.runtime.bundle import CARD, FORMAT, FORMAT_VERSION, MANIFEST, SAMPLER, TEXTURE, file_sha256
 from solidgrain.runtime.errors import BundleError
+from solidgrain.runtime.files import sync
 from solidgrain.runtime.lattice import untiled
 from solidgrain.runtime.noise import noise_tables
 from solidgrain.runtime.texture_file import TextureData, write_texture
@@ -62,17 +63,24 @@ def write_bundle(folder: Path, sampler: SamplerWeights, details: Details, overwr
     """
     if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
         raise BundleError(f"{folder}: already exists; choose another --out, or --overwrite to replace a bundle")
+    if folder.exists() and (strange := {path.name for path in folder.iterdir()} - {MANIFEST, SAMPLER, TEXTURE, CARD}):
+        raise BundleError(f"{folder}: holds {', '.join(sorted(strange))}, which is no part of a bundle; move it away first")
+    folder = folder.resolve()
     building = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    former = folder.with_name(f".{folder.name}.{os.getpid()}.old")
     try:
         building.mkdir(parents=True)
         _fill(building, sampler, details)
+        for path in building.iterdir():
+            sync(path)
         if folder.exists():
-            shutil.rmtree(folder)
+            folder.rename(former)
         building.rename(folder)
     except OSError as error:
         raise BundleError(f"{folder}: cannot write the bundle ({error.strerror})") from error
     finally:
         shutil.rmtree(building, ignore_errors=True)
+        shutil.rmtree(former, ignore_errors=True)
     return folder
 
 

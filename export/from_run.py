@@ -34,7 +34,10 @@ def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = Fa
     if state is None:
         raise TrainingError(f"{run_folder}: no checkpoint yet; let solidgrain train --resume {run_folder} go on for a while")
     average = Sampler(run.settings, torch.Generator())
-    average.load_state_dict(state["average"])
+    try:
+        average.load_state_dict(state["average"])
+    except (RuntimeError, TypeError) as error:
+        raise TrainingError(f"{run_folder}: the checkpoint does not fit the run's settings; start the run again") from error
     weights = sampler_weights(average)
     check_agreement(average, weights)
     training = provenance(run, state)
@@ -90,10 +93,10 @@ def _random_points(seed: int) -> DoubleArray:
 def provenance(run: Run, state: dict[str, Any]) -> dict[str, Any]:
     """What the manifest says about the training."""
     return {
-        "exemplars": [vars(run.provenance)],
+        "exemplars": [{**vars(run.source), "sha256": run.sha256}],
         "iterations": state["iteration"],
         "minutes": round(state["seconds"] / 60, 1),
         "revision": run.revision,
         "settings": to_json(run.settings),
-        "losses": run.last_stats(),
+        "losses": next(reversed(run.stats_until(state["iteration"])), {}),
     }

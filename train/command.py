@@ -5,20 +5,24 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal
 
-from solidgrain.runtime.errors import TrainingError
+from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive, parse_seed
+from solidgrain.runtime.errors import TrainingError, UsageError
 
 if TYPE_CHECKING:
     import torch
 
-    from solidgrain.train.loop import Budget, Report
+    from solidgrain.train.loop import Report
     from solidgrain.train.run import Run
-    from solidgrain.train.settings import Settings
+    from solidgrain.train.settings import Budget, Settings
 
 INTERRUPTED = 130
+SMALLEST_PATCH = 32  # pixels
+FIXED = ("preset", "anisotropic", "patch", "batch", "seed", "precision", "license", "credit")  # what a run settles for good
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,9 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--out", type=Path, metavar="RUN", help="the run directory to make")
     where.add_argument("--resume", type=Path, metavar="RUN", help="go on with a run where its last checkpoint left it")
-    add("--preset", choices=("fast", "paper"), default="fast", help="fast: few CPU minutes; paper: the paper's settings (fast)")
-    add("--iterations", type=int, metavar="N", help="stop after N iterations in all")
-    add("--minutes", type=float, metavar="M", help="stop after M minutes of training in all")
+    add("--preset", choices=("fast", "paper"), help="fast: few CPU minutes; paper: the paper's settings (fast)")
+    add("--iterations", type=parse_positive, metavar="N", help="stop after N iterations in all")
+    add("--minutes", type=parse_minutes, metavar="M", help="stop after M minutes of training in all")
     add(
         "--anisotropic",
         nargs="?",
@@ -38,14 +42,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="AXIS",
         help="oriented material: slices turn about the grain, image axis x or y (measured if not given)",
     )
-    add("--patch", type=int, metavar="PX", help="pixels along each side of a patch")
-    add("--batch", type=int, metavar="N", help="patches per iteration")
-    add("--seed", type=int, default=0, metavar="N", help="of all randomness (0)")
-    add("--precision", choices=("auto", "float32", "bfloat16"), default="auto", help="of plain forward passes (auto)")
+    add("--patch", type=parse_positive, metavar="PX", help="pixels along each side of a patch, at least 32")
+    add("--batch", type=parse_positive, metavar="N", help="patches per iteration")
+    add("--seed", type=parse_seed, metavar="N", help="of all randomness (0)")
+    add("--precision", choices=("auto", "float32", "bfloat16"), help="of plain forward passes (auto)")
     add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (auto)")
-    add("--threads", type=int, default=0, metavar="N", help="0: every processor that the process may use (0)")
-    add("--license", default="", metavar="TEXT", help="the photograph's licence, for the model card")
-    add("--credit", default="", metavar="TEXT", help="whom to credit, for the model card")
+    add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
+    add("--license", metavar="TEXT", help="the photograph's licence, for the model card")
+    add("--credit", metavar="TEXT", help="whom to credit, for the model card")
     add("--quiet", action="store_true", help="no progress on stderr")
 
 
@@ -55,13 +59,11 @@ def run(arguments: argparse.Namespace) -> int:
     from solidgrain.runtime.provider import usable_threads
     from solidgrain.train.loop import train
 
-    check_budget(arguments)
     device = choose_device(arguments.device)
     torch.set_num_threads(arguments.threads or usable_threads())
     training = resume(arguments) if arguments.resume else start(arguments)
-    budget = make_budget(arguments, training.settings)
     stop = StopRequest()
-    train(training, budget, device, Progress(budget, arguments.quiet).show, stop.requested)
+    train(training, training.budget, device, Progress(training.budget, arguments.quiet).show, stop.requested)
     folder = training.folder
     if stop.requested():
         print(f"stopped and saved; go on with: solidgrain train --resume {folder}", file=sys.stderr)
@@ -73,10 +75,10 @@ def run(arguments: argparse.Namespace) -> int:
 def start(arguments: argparse.Namespace) -> Run:
     """A new run directory for the photograph, with a warning if one texture cannot describe it."""
     from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity, read_exemplar
-    from solidgrain.train.run import create_run
+    from solidgrain.train.run import Source, create_run
 
     if arguments.exemplar is None:
-        raise TrainingError("no EXEMPLAR given; expected a photograph to learn from")
+        raise UsageError("no EXEMPLAR given; expected a photograph to learn from")
     settings = make_settings(arguments)
     exemplar = read_exemplar(arguments.exemplar, settings.patch)
     if (found := nonstationarity(exemplar)) > NONSTATIONARY:
@@ -86,27 +88,23 @@ def start(arguments: argparse.Namespace) -> Run:
             file=sys.stderr,
         )
     settings = with_grain(settings, arguments.anisotropic, exemplar)
-    return create_run(arguments.out, settings, exemplar, arguments.exemplar.name, arguments.license, arguments.credit)
+    source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "")
+    return create_run(arguments.out, settings, exemplar, source, make_budget(arguments, settings.preset))
 
 
 def make_settings(arguments: argparse.Namespace) -> Settings:
-    """The preset, with what the flags change. Raises TrainingError for values that make no sense."""
+    """The preset, with what the flags change. Raises UsageError for a patch that is too small."""
     from solidgrain.train.settings import preset
 
-    changes: dict[str, Any] = {"seed": arguments.seed, "precision": arguments.precision}
-    for name, least in (("patch", 32), ("batch", 1)):
-        value = getattr(arguments, name)
-        if value is not None:
-            if value < least:
-                raise TrainingError(f"--{name} {value}: expected at least {least}")
-            changes[name] = value
-    return preset(arguments.preset, **changes)
+    changes = {name: getattr(arguments, name) for name in ("patch", "batch", "seed", "precision")}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if changes.get("patch", SMALLEST_PATCH) < SMALLEST_PATCH:
+        raise UsageError(f"--patch {arguments.patch}: expected at least {SMALLEST_PATCH}")
+    return preset(arguments.preset or "fast", **changes)
 
 
 def with_grain(settings: Settings, anisotropic: str | None, exemplar: Any) -> Settings:
     """The settings for an oriented material: the axis about which slices turn, and how long its structures start."""
-    from dataclasses import replace
-
     from solidgrain.train.exemplar import measure_grain
 
     if anisotropic is None:
@@ -118,27 +116,25 @@ def with_grain(settings: Settings, anisotropic: str | None, exemplar: Any) -> Se
 
 
 def resume(arguments: argparse.Namespace) -> Run:
+    """The run to go on with, under its own settings; --iterations and --minutes replace its budget."""
     from solidgrain.train.run import open_run
 
     if arguments.exemplar is not None:
-        raise TrainingError(f"--resume {arguments.resume}: the run has its exemplar already; leave {arguments.exemplar} out")
-    return open_run(arguments.resume)
+        raise UsageError(f"--resume {arguments.resume}: the run has its exemplar already; leave {arguments.exemplar} out")
+    if given := [f"--{name}" for name in FIXED if getattr(arguments, name) is not None]:
+        raise UsageError(f"--resume {arguments.resume}: the run has settled {', '.join(given)} already; leave them out")
+    training = open_run(arguments.resume)
+    if arguments.iterations is None and arguments.minutes is None:
+        return training
+    return replace(training, budget=make_budget(arguments, training.settings.preset))
 
 
-def check_budget(arguments: argparse.Namespace) -> None:
-    for name in ("iterations", "minutes"):
-        value = getattr(arguments, name)
-        if value is not None and not value > 0:
-            raise TrainingError(f"--{name} {value}: expected more than 0")
-
-
-def make_budget(arguments: argparse.Namespace, settings: Settings) -> Budget:
+def make_budget(arguments: argparse.Namespace, preset_name: str) -> Budget:
     """How long to train: what the flags say, or the preset's iterations."""
-    from solidgrain.train.loop import Budget
-    from solidgrain.train.settings import PRESET_ITERATIONS
+    from solidgrain.train.settings import PRESET_ITERATIONS, Budget
 
     if arguments.iterations is None and arguments.minutes is None:
-        return Budget(iterations=PRESET_ITERATIONS[settings.preset])
+        return Budget(iterations=PRESET_ITERATIONS[preset_name])
     return Budget(arguments.iterations, arguments.minutes)
 
 

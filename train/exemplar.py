@@ -37,7 +37,9 @@ def read_exemplar(path: str | os.PathLike[str], smallest: int) -> FloatArray:
         raise ExemplarError(f"{path}: no such file; expected a photograph (PNG, JPEG, TIFF, EXR, ...)")
     if path.stat().st_size == 0:
         raise ExemplarError(f"{path}: the file is empty; expected a photograph (PNG, JPEG, TIFF, EXR, ...)")
-    opened = oiio.ImageInput.open(os.fspath(path))
+    straight = oiio.ImageSpec()
+    straight.attribute("oiio:UnassociatedAlpha", 1)  # colours as they are in the file, not multiplied by alpha
+    opened = oiio.ImageInput.open(os.fspath(path), straight)
     if opened is None:
         raise ExemplarError(f"{path}: not readable as an image ({_first_line(oiio.geterror())})")
     try:

@@ -18,29 +18,10 @@ from solidgrain.train.exemplar import draw_patches
 from solidgrain.train.losses import gradient_penalty, style_loss
 from solidgrain.train.noise import draw_tables
 from solidgrain.train.preview import write_preview
-from solidgrain.train.run import Run
+from solidgrain.train.run import PARTS, Run
 from solidgrain.train.sampler import Sampler
-from solidgrain.train.settings import Settings, rate
+from solidgrain.train.settings import Budget, Settings, rate
 from solidgrain.train.slices import draw_slices
-
-PARTS = ("critic", "sampler", "average", "critic_optimiser", "sampler_optimiser")  # what a checkpoint holds
-
-
-@dataclass(frozen=True)
-class Budget:
-    """When to stop: after that many iterations or minutes of training in all, whichever comes first."""
-
-    iterations: int | None = None
-    minutes: float | None = None
-
-    def done(self, iteration: int, seconds: float) -> bool:
-        return self.progress(iteration, seconds) >= 1.0
-
-    def progress(self, iteration: int, seconds: float) -> float:
-        """The share of the budget that is spent."""
-        by_iteration = iteration / self.iterations if self.iterations else 0.0
-        by_time = seconds / (60 * self.minutes) if self.minutes else 0.0
-        return max(by_iteration, by_time)
 
 
 @dataclass(frozen=True)
@@ -72,7 +53,7 @@ class Trainer:
 
     def step(self) -> Report:
         """One iteration: synthesise slices, improve the critic on them, then the sampler against it."""
-        settings = self.settings
+        settings, started = self.settings, time.monotonic()
         self._set_rates()
         fake = self.synthesise()  # (B, 3, patch, patch)
         real = draw_patches(self.exemplar, settings, self.generator)
@@ -91,6 +72,7 @@ class Trainer:
 
         self._update_average()
         self.iteration += 1
+        self.seconds += time.monotonic() - started
         return Report(
             iteration=self.iteration,
             seconds=self.seconds,
@@ -158,10 +140,14 @@ class Trainer:
         state = self.run.load_checkpoint()
         if state is None:
             return
+        try:
+            for name in PARTS:
+                getattr(self, name).load_state_dict(state[name])
+            self.generator.set_state(state["generator"])
+        except (RuntimeError, ValueError, TypeError) as error:
+            reason = str(error).splitlines()[0]
+            raise TrainingError(f"{self.run.folder}: the checkpoint does not fit the run or --device ({reason})") from error
         self.iteration, self.seconds = state["iteration"], state["seconds"]
-        for name in PARTS:
-            getattr(self, name).load_state_dict(state[name])
-        self.generator.set_state(state["generator"])
 
 
 def train(
@@ -181,10 +167,8 @@ def train(
     run.rewind_stats(trainer.iteration)
     settings, report = run.settings, None
 
-    started = time.monotonic() - trainer.seconds
     while not budget.done(trainer.iteration, trainer.seconds) and not should_stop():
         report = trainer.step()
-        trainer.seconds = time.monotonic() - started
         if not math.isfinite(report.critic_loss + report.style):
             raise TrainingError(
                 f"{run.folder}: the training diverged at iteration {report.iteration} (losses are not finite); "

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from solidgrain.runtime.errors import TrainingError
+from solidgrain.runtime.files import temporary_name
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.noise import draw_tables
 from solidgrain.train.sampler import Sampler
@@ -45,9 +46,11 @@ def write_preview(path: Path, sampler: Sampler, settings: Settings, exemplar: Fl
 def _write_png(path: Path, image: FloatArray) -> None:
     import OpenImageIO as oiio
 
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.png")
+    temporary = temporary_name(path)
     buffer = oiio.ImageBuf(np.ascontiguousarray(image))
-    if not buffer.write(os.fspath(temporary), oiio.UINT8):
+    written = buffer.write(os.fspath(temporary), oiio.UINT8)
+    reader = oiio.ImageInput.open(os.fspath(temporary)) if written else None
+    if reader is None or reader.read_image(oiio.UINT8) is None:  # only reading it back shows that the disk was full
         temporary.unlink(missing_ok=True)
-        raise TrainingError(f"{path}: cannot write the sample ({buffer.geterror()})")
+        raise TrainingError(f"{path}: cannot write the sample; make space and go on with --resume")
     os.replace(temporary, path)

@@ -35,6 +35,7 @@ Measures = dict[str, float]
 FEATURES = ("1.0", "1.2", "pool", "2.6", "2.8", "pool", "3.12", "3.14", "3.16", "pool", "4.20")  # VGG-16 convolutions
 FRECHET_LAYERS, GRAM_LAYERS = (1, 3), (0, 2, 4, 7)
 LARGEST_CROP = 256  # pixels
+SMALLEST = 64  # pixels along each side of an exemplar: its crops must outlast the pyramids
 
 
 @dataclass(frozen=True)

@@ -10,33 +10,35 @@ RUN/checkpoint.pt    everything that the next iteration depends on, replaced who
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-import os
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
 
 from solidgrain.runtime.errors import TrainingError
+from solidgrain.runtime.files import replacing
 from solidgrain.train import settings as settings_module
 from solidgrain.train.exemplar import FloatArray
-from solidgrain.train.settings import Settings
+from solidgrain.train.settings import Budget, Settings
 
+PARTS = ("critic", "sampler", "average", "critic_optimiser", "sampler_optimiser")  # the state of each is in a checkpoint
+CHECKPOINT_KEYS = {*PARTS, "iteration", "seconds", "generator"}
 CHECKPOINT, OPTIONS, EXEMPLAR, STATS = "checkpoint.pt", "options.json", "exemplar.npy", "stats.jsonl"
 
 
 @dataclass(frozen=True)
-class Provenance:
+class Source:
     """Where the pixels came from; goes into the bundle's manifest."""
 
     exemplar: str  # file name
-    sha256: str  # of the pixels
     license: str
     credit: str
 
@@ -47,13 +49,22 @@ class Run:
 
     folder: Path
     settings: Settings
-    provenance: Provenance
+    source: Source
     exemplar: FloatArray
+    budget: Budget
     revision: str  # of solidgrain when the run was started
 
+    @property
+    def sha256(self) -> str:
+        """Of the exemplar's pixels."""
+        return hashlib.sha256(self.exemplar.tobytes()).hexdigest()
+
     def save_checkpoint(self, state: dict[str, Any]) -> None:
-        with _replacing(self.folder / CHECKPOINT) as file:
-            torch.save(state, file)
+        """Replace the checkpoint. Raises TrainingError if it cannot be written; the one before is then untouched."""
+        buffer = io.BytesIO()  # torch's own writer turns a full disk into errors of many types
+        torch.save(state, buffer)
+        with self._written(CHECKPOINT), replacing(self.folder / CHECKPOINT) as file:
+            file.write(buffer.getbuffer())
 
     def load_checkpoint(self) -> dict[str, Any] | None:
         """The last complete checkpoint, or None before the first."""
@@ -62,6 +73,8 @@ class Run:
             return None
         try:
             state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+            if missing := CHECKPOINT_KEYS - state.keys():
+                raise KeyError(f"no {', '.join(sorted(missing))}")
         except Exception as error:  # torch raises a dozen unrelated types for damaged files
             raise TrainingError(
                 f"{path}: damaged checkpoint ({type(error).__name__}); start the run again elsewhere"
@@ -69,40 +82,54 @@ class Run:
         return state
 
     def append_stats(self, line: dict[str, Any]) -> None:
-        with open(self.folder / STATS, "a", encoding="utf-8") as file:
+        with self._written(STATS), open(self.folder / STATS, "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
-    def last_stats(self) -> dict[str, Any]:
-        """The last line of the statistics, empty before the first."""
+    def stats_until(self, iteration: int) -> list[dict[str, Any]]:
+        """The lines of the statistics up to an iteration, without the half line that a kill may leave behind."""
         path = self.folder / STATS
-        lines = path.read_text("utf-8").splitlines() if path.exists() else []
-        return dict(json.loads(lines[-1])) if lines else {}
+        lines = [_parsed(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
+        return [line for line in lines if line.get("iteration", iteration + 1) <= iteration]
 
     def rewind_stats(self, iteration: int) -> None:
         """Drop the lines after a checkpoint's iteration: a resumed run writes them again."""
-        path = self.folder / STATS
-        if path.exists():
-            lines = [line for line in path.read_text("utf-8").splitlines() if _iteration_of(line) <= iteration]
-            with _replacing(path) as file:
-                file.write("".join(line + "\n" for line in lines).encode())
+        kept = self.stats_until(iteration)
+        with self._written(STATS), replacing(self.folder / STATS) as file:
+            file.write("".join(json.dumps(line) + "\n" for line in kept).encode())
+
+    @contextmanager
+    def _written(self, name: str) -> Iterator[None]:
+        """Failed writes, as errors that say what to do."""
+        try:
+            yield
+        except OSError as error:
+            raise TrainingError(
+                f"{self.folder / name}: cannot write ({error.strerror}); the last checkpoint is whole: "
+                f"make space and go on with --resume {self.folder}"
+            ) from error
 
 
-def create_run(folder: Path, settings: Settings, exemplar: FloatArray, name: str, license: str, credit: str) -> Run:
+def create_run(folder: Path, settings: Settings, exemplar: FloatArray, source: Source, budget: Budget) -> Run:
     """A new run directory. Raises TrainingError if the folder already holds a run or cannot be written."""
     if (folder / OPTIONS).exists():
         raise TrainingError(f"{folder}: already holds a run; continue it with --resume {folder}, or choose another --out")
-    provenance = Provenance(name, hashlib.sha256(exemplar.tobytes()).hexdigest(), license, credit)
+    run = Run(folder, settings, source, exemplar, budget, source_revision())
+    options = {
+        "settings": settings_module.to_json(settings),
+        "source": vars(source),
+        "exemplar_sha256": run.sha256,
+        "budget": vars(budget),
+        "revision": run.revision,
+    }
     try:
         (folder / "samples").mkdir(parents=True, exist_ok=True)
-        with _replacing(folder / EXEMPLAR) as file:
+        with replacing(folder / EXEMPLAR) as file:
             np.save(file, exemplar)
-        revision = source_revision()
-        options = {"settings": settings_module.to_json(settings), "provenance": vars(provenance), "revision": revision}
-        with _replacing(folder / OPTIONS) as file:
+        with replacing(folder / OPTIONS) as file:
             file.write(json.dumps(options, indent=2).encode() + b"\n")
     except OSError as error:
         raise TrainingError(f"{folder}: cannot write the run directory ({error.strerror})") from error
-    return Run(folder, settings, provenance, exemplar, revision)
+    return run
 
 
 def open_run(folder: Path) -> Run:
@@ -112,13 +139,16 @@ def open_run(folder: Path) -> Run:
     try:
         options = json.loads((folder / OPTIONS).read_text("utf-8"))
         settings = settings_module.from_json(options["settings"])
-        provenance = Provenance(**options["provenance"])
         exemplar = np.load(folder / EXEMPLAR, allow_pickle=False)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        run = Run(
+            folder, settings, Source(**options["source"]), exemplar, Budget(**options["budget"]), str(options["revision"])
+        )
+        intact = run.sha256 == options["exemplar_sha256"]
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
         raise TrainingError(f"{folder}: damaged run directory ({error}); start the run again elsewhere") from error
-    if hashlib.sha256(exemplar.tobytes()).hexdigest() != provenance.sha256:
+    if not intact:
         raise TrainingError(f"{folder / EXEMPLAR}: not the pixels that the run was started with (sha256 differs)")
-    return Run(folder, settings, provenance, exemplar, str(options["revision"]))
+    return run
 
 
 def source_revision() -> str:
@@ -131,22 +161,9 @@ def source_revision() -> str:
     return f"{version('solidgrain')} ({described})"
 
 
-def _iteration_of(line: str) -> float:
+def _parsed(line: str) -> dict[str, Any]:
     try:
-        return float(json.loads(line)["iteration"])
-    except (ValueError, KeyError):
-        return float("inf")  # the half line that a kill leaves behind
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write beside the file, then put it in place whole: a kill or a full disk leaves the old one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        parsed = json.loads(line)
+    except ValueError:
+        return {}
+    return parsed if isinstance(parsed, dict) else {}

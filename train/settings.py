@@ -59,6 +59,23 @@ class Settings:
     report_every: int = 20
 
 
+@dataclass(frozen=True)
+class Budget:
+    """When to stop: after that many iterations or minutes of training in all, whichever comes first."""
+
+    iterations: int | None = None
+    minutes: float | None = None
+
+    def done(self, iteration: int, seconds: float) -> bool:
+        return self.progress(iteration, seconds) >= 1.0
+
+    def progress(self, iteration: int, seconds: float) -> float:
+        """The share of the budget that is spent."""
+        by_iteration = iteration / self.iterations if self.iterations else 0.0
+        by_time = seconds / (60 * self.minutes) if self.minutes else 0.0
+        return max(by_iteration, by_time)
+
+
 FAST = Settings()
 """Tuned for few CPU minutes. How it departs from the paper, and why, is in docs/training.md."""
 

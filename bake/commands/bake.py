@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import resource
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from solidgrain.runtime.errors import BakeError
+from solidgrain.bake.arguments import parse_count, parse_seed, parse_size, parse_spacing, parse_tile, parse_vector
+from solidgrain.runtime.errors import UsageError
 
 if TYPE_CHECKING:
     from solidgrain.bake.baker import Baked
@@ -51,11 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.baker import bake
-    from solidgrain.bake.plan import check_plan
+    from solidgrain.bake.plan import check_plan, without_existing
     from solidgrain.runtime import load
 
     texture = load(arguments.source, bundle=arguments.bundle, provider=arguments.provider, threads=arguments.threads)
     plan = make_plan(arguments, texture)
+    if arguments.no_clobber:
+        plan = without_existing(plan)
     check_plan(plan, arguments.overwrite)
     if arguments.dry_run:
         report = describe(plan, texture)
@@ -65,7 +67,10 @@ def run(arguments: argparse.Namespace) -> int:
         report = {**describe(plan, texture), "files": []}
     else:
         progress = Progress(arguments.quiet)
-        baked = bake(plan, texture, progress.show)
+        try:
+            baked = bake(plan, texture, progress.show)
+        finally:
+            progress.end_line()
         progress.finish(plan, baked)
         report = result(plan, baked)
     if arguments.json:
@@ -74,21 +79,18 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def make_plan(arguments: argparse.Namespace, texture: Texture) -> Plan:
-    """The plan that the flags ask for. Raises BakeError when they name no output or an impossible one."""
+    """The plan that the flags ask for. Raises UsageError when they name no output or an impossible one."""
     from solidgrain.bake.plan import Plan
-    from solidgrain.bake.writers import Output, make_output, output_exists
+    from solidgrain.bake.writers import Output, make_output
 
     outputs: list[Output] = [make_output(path, **_options(path, arguments)) for path in arguments.out]
     if arguments.preview:
         if arguments.preview.suffix.lower() != ".png":
-            raise BakeError(f"--preview {arguments.preview}: expected a name that ends in .png")
+            raise UsageError(f"--preview {arguments.preview}: expected a name that ends in .png")
         outputs.append(Output(arguments.preview, "preview"))
     if not outputs and not arguments.dry_run:
-        raise BakeError("nothing to write: give at least one --out FILE or --preview FILE.png")
-    paths = [output.path for output in outputs]
-    if twice := next((path for path in paths if paths.count(path) > 1), None):
-        raise BakeError(f"--out {twice}: given twice")
-    plan = Plan(
+        raise UsageError("nothing to write: give at least one --out FILE or --preview FILE.png")
+    return Plan(
         source=arguments.source,
         texture=texture.name,
         sampler_sha256=texture.data.sampler_sha256,
@@ -97,10 +99,8 @@ def make_plan(arguments: argparse.Namespace, texture: Texture) -> Plan:
         origin=arguments.origin,
         spacing=arguments.spacing,
         tile=arguments.tile,
-        outputs=(),
+        outputs=tuple(outputs),
     )
-    kept = [output for output in outputs if not (arguments.no_clobber and output_exists(output, plan.volume))]
-    return Plan(**{**vars(plan), "outputs": tuple(kept)})
 
 
 def _options(path: Path, arguments: argparse.Namespace) -> dict[str, str | int]:
@@ -109,11 +109,10 @@ def _options(path: Path, arguments: argparse.Namespace) -> dict[str, str | int]:
 
 def describe(plan: Plan, texture: Texture) -> dict[str, Any]:
     """What a bake would take: bytes per output, memory, and seconds from a short run of the sampler."""
-    from solidgrain.bake.writers import output_bytes
-    from solidgrain.bake.writers.table import encoding
+    from solidgrain.bake.writers import encoding, output_bytes
 
     started = time.monotonic()
-    probe = 4 * 2048 * texture.threads
+    probe = 4 * 2048 * min(texture.threads, 16)
     texture.grid((1, 1, probe), plan.seed)
     rate = probe / (time.monotonic() - started)
     tiling = texture.tiling(plan.volume.shape, spacing=plan.spacing, tile=plan.tile)
@@ -152,7 +151,7 @@ def summary(report: dict[str, Any]) -> str:
 
 def result(plan: Plan, baked: Baked) -> dict[str, Any]:
     """What `--json` prints after a bake."""
-    from solidgrain.bake.writers.table import encoding
+    from solidgrain.bake.writers import encoding
 
     return {
         "plan": plan.to_json(),
@@ -184,54 +183,13 @@ class Progress:
             flush=True,
         )
 
+    def end_line(self) -> None:
+        """Leave the bar's line, so that whatever is printed next has its own."""
+        if self.terminal and not self.quiet:
+            print(file=sys.stderr)
+
     def finish(self, plan: Plan, baked: Baked) -> None:
         if self.quiet:
             return
         rate = plan.volume.voxels / baked.seconds / 1e6
-        end = "\n" if self.terminal else ""
-        print(f"{end}{plan.texture}: {len(baked.files)} files in {baked.seconds:.1f} s, {rate:.2f} Mvoxel/s", file=sys.stderr)
-
-
-def parse_size(text: str) -> tuple[int, int, int]:
-    """ "128" or "256x128x64" (x, y, z)."""
-    parts = text.replace(",", "x").split("x")
-    numbers = [int(part) if part.isdecimal() else 0 for part in (parts * 3 if len(parts) == 1 else parts)]
-    if len(numbers) != 3 or min(numbers) < 1:
-        raise argparse.ArgumentTypeError(f"expected N or XxYxZ, whole numbers above 0, found {text!r}")
-    return (numbers[0], numbers[1], numbers[2])
-
-
-def parse_vector(text: str) -> tuple[float, float, float]:
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
-        raise argparse.ArgumentTypeError(f"expected X,Y,Z, three numbers, found {text!r}")
-    return (numbers[0], numbers[1], numbers[2])
-
-
-def parse_spacing(text: str) -> tuple[float, float, float]:
-    """One number for all axes, or X,Y,Z."""
-    spacing = parse_vector(text if "," in text else ",".join([text] * 3))
-    if min(spacing) <= 0:
-        raise argparse.ArgumentTypeError(f"expected exemplar pixels per voxel, above 0, found {text!r}")
-    return spacing
-
-
-def parse_tile(text: str) -> str:
-    if not set(text) <= set("xyz") or len(set(text)) != len(text):
-        raise argparse.ArgumentTypeError(f"expected each of x, y, z at most once, found {text!r}")
-    return "".join(sorted(text))
-
-
-def parse_count(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, found {text!r}")
-    return int(text)
-
-
-def parse_seed(text: str) -> int:
-    if not text.isdecimal() or int(text) >= 2**64:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to 2^64 - 1, found {text!r}")
-    return int(text)
+        print(f"{plan.texture}: {len(baked.files)} files in {baked.seconds:.1f} s, {rate:.2f} Mvoxel/s", file=sys.stderr)

@@ -79,9 +79,14 @@ def _providers(problems: list[str]) -> dict[str, str]:
 def _textures(problems: list[str]) -> dict[str, float]:
     """The embedded textures, with their largest difference from the colours in their manifests."""
     from solidgrain.bake.commands.info import TOLERANCE, probe_error
-    from solidgrain.runtime import embedded_names, load
+    from solidgrain.runtime import SolidgrainError, embedded_names, load
 
-    errors = {name: probe_error(load(name)) for name in embedded_names()}
+    errors = {}
+    for name in embedded_names():
+        try:
+            errors[name] = probe_error(load(name))
+        except SolidgrainError as error:
+            problems.append(str(error))
     problems += [
         f"{name}: colours differ from the manifest by {error:.1g}" for name, error in errors.items() if error > TOLERANCE
     ]

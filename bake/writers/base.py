@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -12,7 +13,7 @@ from typing import BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.runtime.errors import BakeError
+from solidgrain.runtime.files import temporary_name
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -52,53 +53,50 @@ class Output:
 class Writer(ABC):
     """Takes the slabs of a volume in order. Nothing is visible under its final name before `commit`."""
 
-    def __init__(self, output: Output, volume: Volume) -> None:
-        self.output, self.volume = output, volume
+    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
+        self.output, self.volume, self.threads = output, volume, threads
 
     @abstractmethod
     def write(self, z: int, slab: FloatArray) -> None:
         """One slab: slices z, z + 1, ..., [<= slab, y, x, 3] in [0, 1], sRGB-encoded."""
 
     @abstractmethod
+    def finish(self) -> None:
+        """Complete the files, still under temporary names, down to the disk. All that can fail has failed after this."""
+
+    @abstractmethod
     def commit(self) -> Sequence[Path]:
-        """Put the finished files in place and name them."""
+        """Give the finished files their names."""
 
     @abstractmethod
     def abort(self) -> None:
-        """Remove whatever has been written so far. Safe to call at any time, more than once."""
+        """Remove whatever has been written and not committed. Safe to call at any time, more than once."""
 
 
 class FileWriter(Writer):
     """A writer of a single file, under a temporary name in the same folder until it is whole."""
 
-    def __init__(self, output: Output, volume: Volume) -> None:
-        super().__init__(output, volume)
+    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
+        super().__init__(output, volume, threads)
         self.temporary = temporary_name(output.path)
         self.file: BinaryIO = open(self.temporary, "wb")  # noqa: SIM115
 
-    def commit(self) -> Sequence[Path]:
+    def finish(self) -> None:
         self.file.flush()
         os.fsync(self.file.fileno())
         self.file.close()
+
+    def commit(self) -> Sequence[Path]:
         os.replace(self.temporary, self.output.path)
         return [self.output.path]
 
     def abort(self) -> None:
-        self.file.close()
+        with suppress(OSError):  # closing flushes, which fails again on a full disk
+            self.file.close()
         self.temporary.unlink(missing_ok=True)
-
-
-def temporary_name(path: Path) -> Path:
-    """A hidden name beside the file, this process's own."""
-    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def to_uint8(rgb: FloatArray) -> npt.NDArray[np.uint8]:
     """[0, 1] to 0 .. 255, to the nearest."""
     scaled: npt.NDArray[np.uint8] = (rgb.clip(0, 1) * 255 + 0.5).astype(np.uint8)
     return scaled
-
-
-def check_no_options(output: Output) -> None:
-    if output.options:
-        raise BakeError(f"{output.path}: {', '.join(output.options)} does not apply to {output.kind}")

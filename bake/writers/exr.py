@@ -19,9 +19,9 @@ import numpy as np
 
 from solidgrain.bake.color import to_linear
 from solidgrain.bake.frames import frame_paths
-from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer, temporary_name
+from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer
 from solidgrain.runtime.errors import BakeError
-from solidgrain.runtime.provider import usable_threads
+from solidgrain.runtime.files import sync, temporary_name
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # xy of red, green, blue, white (ITU-R BT.709)
 
@@ -29,30 +29,32 @@ REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # xy of red, gree
 class ExrStack(Writer):
     """Slices gather in a hidden folder beside their destination until all of them are whole."""
 
-    def __init__(self, output: Output, volume: Volume) -> None:
+    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
         import OpenEXR
 
-        super().__init__(output, volume)
+        super().__init__(output, volume, threads)
         OpenEXR.set_global_thread_count(0)  # one slice per thread of ours beats its own pool
         self.paths = files(output, volume)
         self.staging = temporary_name(output.path)
         self.staging.mkdir()
 
     def write(self, z: int, slab: FloatArray) -> None:
-        half = to_linear(slab).astype(np.float16)
-        with ThreadPoolExecutor(usable_threads()) as pool:
-            list(pool.map(self._write_slice, range(z, z + len(slab)), half))
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(self._write_slice, range(z, z + len(slab)), slab))
 
-    def _write_slice(self, z: int, pixels: Any) -> None:
+    def _write_slice(self, z: int, rgb: FloatArray) -> None:
         import OpenEXR
 
+        pixels = to_linear(rgb).astype(np.float16)
         path = self.staging / self.paths[z].name
         try:
             OpenEXR.File(slice_header(self.volume, z), {"RGB": np.ascontiguousarray(pixels)}).write(os.fspath(path))
         except RuntimeError as error:
-            raise BakeError(f"{self.paths[z]}: cannot write ({error})") from error
-        with open(path, "rb") as file:
-            os.fsync(file.fileno())
+            raise BakeError(f"{self.paths[z]}: cannot write ({error}); free space or bake elsewhere") from error
+        sync(path)
+
+    def finish(self) -> None:
+        """Nothing: each slice is whole as soon as it is written."""
 
     def commit(self) -> Sequence[Path]:
         for path in self.paths:

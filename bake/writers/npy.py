@@ -10,8 +10,8 @@ from solidgrain.bake.writers.base import FileWriter, FloatArray, Output, Volume
 class NpyFile(FileWriter):
     """Header first, then the slabs as they come."""
 
-    def __init__(self, output: Output, volume: Volume) -> None:
-        super().__init__(output, volume)
+    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
+        super().__init__(output, volume, threads)
         header = {"descr": "<f4", "fortran_order": False, "shape": (*volume.shape, 3)}
         np.lib.format.write_array_header_1_0(self.file, header)
 

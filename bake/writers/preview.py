@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer, temporary_name, to_uint8
+from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer, to_uint8
 from solidgrain.runtime.errors import BakeError
+from solidgrain.runtime.files import sync, temporary_name
 
 PANEL = 384  # pixels along each side of a panel
 GAP = 12
@@ -37,15 +38,15 @@ class Plane:
 class PreviewFile(Writer):
     """Collects six planes, draws when the last slab has come."""
 
-    def __init__(self, output: Output, volume: Volume) -> None:
-        super().__init__(output, volume)
+    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
+        super().__init__(output, volume, threads)
         extents = volume.shape[::-1]
         self.steps = [-(-extent // FINEST) for extent in extents]
         middles = [Plane(axis, extents[axis] // 2) for axis in (2, 1, 0)]
         faces = [Plane(0, extents[0] - 1), Plane(1, 0), Plane(2, extents[2] - 1)]
         self.middles, self.faces = middles, faces
         self.parts: dict[Plane, list[FloatArray]] = {plane: [] for plane in [*middles, *faces]}
-        self.temporary = temporary_name(output.path).with_suffix(".png")
+        self.temporary = temporary_name(output.path)
 
     def write(self, z: int, slab: FloatArray) -> None:
         thin_x, thin_y, thin_z = self.steps
@@ -59,21 +60,30 @@ class PreviewFile(Writer):
             elif plane.axis == 0:
                 parts.append(thinned[:, ::thin_y, plane.index].copy())  # [z, y]
 
-    def commit(self) -> Sequence[Path]:
-        import OpenImageIO as oiio
-
+    def finish(self) -> None:
         planes = {plane: np.concatenate(parts) for plane, parts in self.parts.items()}
         slices = [planes[plane] if plane.axis == 2 else planes[plane][::-1] for plane in self.middles]
         block = draw_block([planes[plane] for plane in self.faces], self.volume.shape[::-1])
         gap = np.full((PANEL, GAP, 3), BACKGROUND, np.float32)
         panels = [part for picture in [*map(fit, slices), block] for part in (picture, gap)][:-1]
-        picture = to_uint8(np.concatenate(panels, axis=1))
+        self._write(to_uint8(np.concatenate(panels, axis=1)))
+
+    def _write(self, picture: npt.NDArray[np.uint8]) -> None:
+        """OpenImageIO reports success on a full disk: only reading the file back tells."""
+        import OpenImageIO as oiio
+
         image = oiio.ImageBuf(np.ascontiguousarray(picture))
         image.specmod().attribute("oiio:ColorSpace", "srgb_rec709_scene")
         image.specmod().attribute("Software", "solidgrain")
-        image.specmod().attribute("DateTime", "")
-        if not image.write(os.fspath(self.temporary)):
-            raise BakeError(f"{self.output.path}: cannot write the preview ({image.geterror()})")
+        image.specmod().attribute("DateTime", "")  # no time stamp: equal volumes are equal bytes
+        written = image.write(os.fspath(self.temporary))
+        reader = oiio.ImageInput.open(os.fspath(self.temporary)) if written else None
+        again = reader.read_image(oiio.UINT8) if reader else None
+        if again is None or not np.array_equal(again, picture):
+            raise BakeError(f"{self.output.path}: cannot write the preview; free space or bake elsewhere")
+        sync(self.temporary)
+
+    def commit(self) -> Sequence[Path]:
         os.replace(self.temporary, self.output.path)
         return [self.output.path]
 

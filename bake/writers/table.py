@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from solidgrain.bake.writers.base import Output, Volume, Writer
-from solidgrain.runtime.errors import BakeError
+from solidgrain.runtime.errors import UsageError
 
 
 @dataclass(frozen=True)
 class Format:
     """A file format: how to open it, its size at most, and the files that a path stands for."""
 
-    opener: Callable[[Output, Volume], Writer]
+    opener: Callable[[Output, Volume, int], Writer]
     size: Callable[[Output, Volume], int]
     files: Callable[[Output, Volume], list[Path]]
     encoding: str  # of its colours
@@ -41,14 +41,19 @@ def suffixes() -> list[str]:
 
 
 def make_output(path: Path, **options: str | int) -> Output:
-    """The output that a file name asks for. Raises BakeError for a suffix that nothing writes."""
+    """The output that a file name asks for. Raises UsageError for a suffix that nothing writes."""
     if path.suffix.lower() not in suffixes():
-        raise BakeError(f"--out {path}: unknown format {path.suffix!r}; pick one of {', '.join(suffixes())}")
+        raise UsageError(f"--out {path}: unknown format {path.suffix!r}; pick one of {', '.join(suffixes())}")
     return Output(path, path.suffix.lower(), options)
 
 
-def open_writer(output: Output, volume: Volume) -> Writer:
-    return _formats()[output.kind].opener(output, volume)
+def open_writer(output: Output, volume: Volume, threads: int) -> Writer:
+    return _formats()[output.kind].opener(output, volume, threads)
+
+
+def output_files(output: Output, volume: Volume) -> list[Path]:
+    """The files that an output will be, as absolute paths."""
+    return [path.absolute() for path in _formats()[output.kind].files(output, volume)]
 
 
 def encoding(output: Output) -> str:
@@ -63,4 +68,4 @@ def output_bytes(output: Output, volume: Volume) -> int:
 
 def output_exists(output: Output, volume: Volume) -> Path | None:
     """The first file of an output that exists already."""
-    return next((path for path in _formats()[output.kind].files(output, volume) if path.exists()), None)
+    return next((path for path in output_files(output, volume) if path.exists()), None)

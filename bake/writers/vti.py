@@ -8,7 +8,6 @@ The encoding, texture and seed are field data.
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 
 import numpy as np
 
@@ -21,19 +20,20 @@ TYPES = {"uint8": ("UInt8", 1), "float32": ("Float32", 4)}
 class VtiFile(FileWriter):
     """The data's length is known beforehand, so header, slabs and trailer follow each other without seeking back."""
 
-    def __init__(self, output: Output, volume: Volume) -> None:
-        super().__init__(output, volume)
+    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
+        super().__init__(output, volume, threads)
         self.dtype = _dtype(output)
         self.file.write(_header(volume, TYPES[self.dtype][0]).encode("ascii"))
         self.file.write(struct.pack("<Q", volume.voxels * 3 * TYPES[self.dtype][1]))
 
     def write(self, z: int, slab: FloatArray) -> None:
-        data = to_uint8(slab) if self.dtype == "uint8" else np.ascontiguousarray(slab, "<f4")
-        self.file.write(data.data)
+        for level in slab:  # one at a time: a converted slab would be another slab of memory
+            data = to_uint8(level) if self.dtype == "uint8" else np.ascontiguousarray(level, "<f4")
+            self.file.write(data.data)
 
-    def commit(self) -> list[Path]:
+    def finish(self) -> None:
         self.file.write(b"\n  </AppendedData>\n</VTKFile>\n")
-        return list(super().commit())
+        super().finish()
 
 
 def size(output: Output, volume: Volume) -> int:

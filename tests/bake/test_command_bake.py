@@ -86,16 +86,30 @@ def test_flags_that_make_no_sense_are_usage_errors_in_one_line(solidgrain, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+USAGE = (
+    "pick one of .exr, .vti, .npy",
+    "a.####.exr",
+    "a.vti: two outputs",
+    "a.01.exr: two outputs",
+    "ends in .png",
+    "nothing to write",
+)
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--out", "a.tga"], "pick one of .exr, .vti, .npy"),
         (["--out", "a.exr"], "a.####.exr"),
-        (["--out", "a.vti", "--out", "a.vti"], "given twice"),
+        (["--out", "a.vti", "--out", "./a.vti"], "a.vti: two outputs"),
+        (["--out", "a.##.exr", "--out", "a.%02d.exr", "--size", "4"], "a.01.exr: two outputs"),
         (["--preview", "a.jpg"], "ends in .png"),
         (["--out", "missing/a.vti"], "does not exist"),
         (["--out", "a.vti", "--size", "1000x1000x10000000"], "free"),
         (["--out", "a.vti", "--size", "2000000x2000000x1"], "memory"),
+        (["--preview", "a.png", "--size", "1x1x9000000000"], "memory"),
+        (["--out", "a.####.exr", "--size", "1000000000"], "memory"),
+        (["--out", "a.vti", "--origin", "-1e300,0,0"], "expected at most"),
         (["--out", "a.vti", "--provider", "rocket"], "provider 'rocket'"),
         ([], "nothing to write"),
     ],
@@ -103,7 +117,7 @@ def test_flags_that_make_no_sense_are_usage_errors_in_one_line(solidgrain, tmp_p
 def test_what_cannot_work_is_refused_before_any_work(solidgrain, tmp_path, toy_folder, monkeypatch, flags, message):
     monkeypatch.chdir(tmp_path)
     outcome = solidgrain("bake", toy_folder, *flags)
-    assert outcome.code == 1
+    assert outcome.code == (2 if message in USAGE else 1)
     assert message in outcome.error
     assert list(tmp_path.iterdir()) == []
 

@@ -69,8 +69,29 @@ def test_a_file_that_is_no_volume_is_refused(solidgrain, tmp_path, name, content
         (tmp_path / name).write_bytes(content)
     outcome = solidgrain("view", tmp_path / name, "--screenshot", tmp_path / "view.png")
     assert outcome.code == 1
-    assert name in outcome.err
+    assert name in outcome.error
     assert not (tmp_path / "view.png").exists()
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.zeros((2, 2, 2)),
+        np.zeros((0, 2, 2, 3)),
+        np.full((2, 2, 2, 3), np.nan),
+        np.full((2, 2, 2, 3), "a"),
+        np.zeros((2, 2, 2, 3), int),
+    ],
+)
+def test_an_array_that_is_no_volume_is_refused(solidgrain, tmp_path, array):
+    np.save(tmp_path / "odd.npy", array)
+    assert "odd.npy" in solidgrain("view", tmp_path / "odd.npy", "--screenshot", tmp_path / "view.png").error
+
+
+def test_a_closed_pipe_is_no_traceback():
+    command = f"{sys.executable} -m solidgrain.bake.cli info --json | head -c 1"
+    outcome = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert "Traceback" not in outcome.stderr
 
 
 def test_info_says_what_granite_is_and_that_it_is_reproduced(solidgrain):

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from solidgrain.bake.frames import frame_paths
-from solidgrain.runtime import BakeError
+from solidgrain.runtime import UsageError
 
 
 @pytest.mark.parametrize(
@@ -23,5 +23,5 @@ def test_patterns(pattern, count, first, names):
 
 @pytest.mark.parametrize("pattern", ["a.exr", "a.##.%02d.exr"])
 def test_a_stack_needs_exactly_one_pattern(pattern):
-    with pytest.raises(BakeError, match=r"a\.####\.exr|one frame pattern"):
+    with pytest.raises(UsageError, match=r"a\.####\.exr|one frame pattern"):
         frame_paths(Path(pattern), 2, 1)

@@ -6,6 +6,7 @@ The volume has three different extents and a random texture, which has no symmet
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
@@ -146,4 +147,37 @@ def test_a_nan_leaves_nothing_behind(toy, tmp_path, monkeypatch):
     outputs = [make_output(tmp_path / name) for name in ("a.####.exr", "a.vti", "a.npy")]
     with pytest.raises(EvaluationError):
         bake(plan_for(toy, *outputs, Output(tmp_path / "a.png", "preview")), toy)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_nothing_behind_and_old_files_whole(toy, tmp_path, monkeypatch):
+    """Space runs out when the last output is completed: the first ones must not have been replaced by then."""
+    from solidgrain.runtime import BakeError
+
+    outputs = [make_output(tmp_path / name) for name in ("a.####.exr", "a.vti", "a.npy")]
+    for path in bake(plan_for(toy, *outputs), toy).files:
+        path.write_bytes(b"old")
+    calls = []
+
+    def full(number):
+        calls.append(number)
+        if len(calls) == SIZE[2] + 2:  # every slice of the stack, the volume, then the array
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(BakeError, match=r"a\.npy.*No space left on device"):
+        bake(plan_for(toy, *outputs), toy)
+    assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"old"}
+    assert len(list(tmp_path.iterdir())) == SIZE[2] + 2
+
+
+def test_a_preview_that_a_full_disk_cut_short_is_noticed(baked, toy, tmp_path, monkeypatch):
+    """OpenImageIO reports success there: `write` here does the same after writing half a file."""
+    from solidgrain.runtime import BakeError
+
+    half = (baked / "toy.png").read_bytes()[:4096]
+
+    monkeypatch.setattr(oiio.ImageBuf, "write", lambda image, name: bool(Path(name).write_bytes(half)))
+    with pytest.raises(BakeError, match="cannot write the preview"):
+        bake(plan_for(toy, Output(tmp_path / "a.png", "preview")), toy)
     assert list(tmp_path.iterdir()) == []

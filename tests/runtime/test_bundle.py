@@ -8,6 +8,7 @@ import pytest
 
 from solidgrain.export.bundle import Details, write_bundle
 from solidgrain.runtime import BundleError, EvaluationError, ProviderError, embedded_names, load
+from solidgrain.runtime.bundle import file_sha256
 from solidgrain.runtime.texture_file import TextureData, read_texture, write_texture
 from tests.toy import toy_weights
 
@@ -86,8 +87,6 @@ def test_a_swapped_graph_is_noticed(broken, tmp_path):
 
 
 def test_a_graph_that_onnx_runtime_cannot_load_is_named(broken):
-    from solidgrain.runtime.bundle import file_sha256
-
     (broken / "sampler.onnx").write_bytes(b"not a graph")
     digest = file_sha256(broken / "sampler.onnx")
     edit_manifest(broken, files={"sampler.onnx": digest, "texture.sgt.npz": file_sha256(broken / "texture.sgt.npz")})
@@ -113,6 +112,34 @@ def test_a_manifest_that_is_no_manifest_is_refused(broken, text):
     (broken / "manifest.json").write_text(text)
     with pytest.raises(BundleError, match=r"manifest\.json"):
         load(broken)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"files": [1]}, {"files": {"sampler.onnx": 5}}, {"octaves": "16"}, {"probe": {}}, {"training": None}, {"patch": None}],
+)
+def test_a_manifest_with_a_wrong_entry_is_refused(broken, changes):
+    edit_manifest(broken, **changes)
+    with pytest.raises(BundleError, match=next(iter(changes))):
+        load(broken)
+
+
+def test_a_graph_that_takes_other_inputs_is_refused(tmp_path):
+    small = write_bundle(tmp_path / "small", toy_weights(octaves=8), Details(name="small", patch=64))
+    large = write_bundle(tmp_path / "large", toy_weights(octaves=16), Details(name="large", patch=64))
+    shutil.copy(small / "sampler.onnx", large / "sampler.onnx")
+    digest = read_texture(small / "texture.sgt.npz").sampler_sha256
+    data = read_texture(large / "texture.sgt.npz")
+    write_texture(large / "texture.sgt.npz", TextureData("large", digest, **data.arrays()))
+    edit_manifest(large, files={name: file_sha256(large / name) for name in ("sampler.onnx", "texture.sgt.npz")})
+    with pytest.raises(BundleError, match=r"sampler\.onnx: not a sampler for this texture"):
+        load(large)
+
+
+def test_a_folder_of_the_same_name_does_not_hide_an_embedded_texture(tmp_path, monkeypatch):
+    (tmp_path / "granite").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load("granite").name == "granite"
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"hello"])

@@ -58,6 +58,15 @@ def test_basis_is_lower_triangular_and_has_the_determinant_of_what_it_was_made_f
             assert math.prod(np.diag(basis)) == abs(determinant)
 
 
+def test_entries_left_of_a_pivot_are_smaller_than_it():
+    draw = np.random.default_rng(3)
+    for count in (1, 2, 3):
+        basis = lattice_basis(draw.integers(-9000, 9000, (3, count)))
+        for row in (1, 2):
+            assert (basis[row, :row] >= 0).all()
+            assert (basis[row, :row] < basis[row, row]).all()
+
+
 def test_distortion_is_small_for_high_octaves_and_reported_for_low_ones():
     distortion = tiled(transforms(), (128.0, 128.0, 128.0), "xyz").distortion
     assert distortion[8:].max() < 0.06

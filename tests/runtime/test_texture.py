@@ -94,6 +94,37 @@ def test_a_tile_is_continuous_across_its_seam(toy, axes):
         assert step(48.0) < 3 * max(step(17.3), step(31.7)) < 0.01
 
 
+@pytest.mark.parametrize("side", [512, 1000, 1024, 4096, 8192])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_large_tile_is_as_continuous_as_a_small_one(toy, side, axis):
+    def step(at):
+        planes = []
+        for across in (-0.0005, 0.0005):
+            origin, shape = np.array([7.0, 8.0, 9.0]), [16, 16, 16]
+            origin[axis], shape[2 - axis] = at + across - 0.5, 1
+            planes.append(toy.grid(shape, seed=3, tile="xyz", period=(side, side, side), origin=origin))
+        return np.abs(planes[1] - planes[0]).max()
+
+    assert step(side) < 3 * max(step(17.3), step(31.7)) < 0.01
+
+
+@pytest.mark.parametrize(("axes", "side"), [("x", 1024), ("xz", 1024), ("xz", 4096), ("yz", 512)])
+def test_a_tile_repeats_far_out_along_the_axes_that_do_not_tile(toy, axes, side):
+    origin = [side - 2.0 if axis in axes else 1e9 for axis in "xyz"]
+    here = toy.grid((4, 4, 4), seed=3, tile=axes, period=(side, side, side), origin=origin)
+    for k, axis in enumerate("xyz"):
+        if axis in axes:
+            there = [*origin[:k], origin[k] - side, *origin[k + 1 :]]
+            again = toy.grid((4, 4, 4), seed=3, tile=axes, period=(side, side, side), origin=there)
+            assert np.abs(here - again).max() <= 1e-4
+    assert np.abs(np.diff(here, axis=2 - "xyz".index(axes[0]))).max() < 0.35
+
+
+def test_a_tile_too_large_to_be_exact_is_refused(toy):
+    with pytest.raises(EvaluationError, match="too large for an exact seam"):
+        toy.slabs((1, 1, 1), tile="xyz", period=(2**22, 2**22, 2**22))
+
+
 def test_a_tiled_texture_keeps_the_look_of_the_plain_one(toy):
     """Every octave still reads many unrelated texels: neighbouring pixels vary as much, distant ones do not repeat."""
     plain = toy.grid((1, 128, 128), seed=3)[0].mean(-1)
@@ -102,6 +133,12 @@ def test_a_tiled_texture_keeps_the_look_of_the_plain_one(toy):
     centred = tile - tile.mean()
     correlation = np.fft.ifft2(np.abs(np.fft.fft2(centred)) ** 2).real / (centred**2).sum()
     assert np.abs(correlation[12:117, 12:117]).max() < 0.35
+
+
+def test_numpy_numbers_are_numbers(toy):
+    plain = toy.grid((2, 3, 4), 5, spacing=2.0)
+    assert np.array_equal(toy.grid(np.array([2, 3, 4]), np.uint64(5), spacing=np.float32(2)), plain)
+    assert np.array_equal(toy.grid((2, 3, 4), 5, spacing=np.int64(2)), plain)
 
 
 def test_any_number_of_points_can_be_sampled(toy):
@@ -123,6 +160,13 @@ def test_colours_are_clipped_to_the_unit_range(toy_folder, tmp_path):
     [
         (lambda t: t.sample(np.zeros(3)), "points have shape"),
         (lambda t: t.sample([[0, np.nan, 0]]), "finite"),
+        (lambda t: t.sample([["a", "b", "c"]]), "not numbers"),
+        (lambda t: t.sample([[0, 0, 1e300]]), "beyond"),
+        (lambda t: t.grid(4), "shape"),
+        (lambda t: t.grid((1.5, 1, 1)), "shape"),
+        (lambda t: t.grid((1, 1, 1), seed=1.5), "seed"),
+        (lambda t: t.grid((1, 1, 1), seed=None), "seed"),
+        (lambda t: t.grid((1, 1, 1), origin=(1e300, 0, 0)), "at most"),
         (lambda t: t.grid((0, 1, 1)), "shape"),
         (lambda t: t.grid((1, 1)), "shape"),
         (lambda t: t.grid((1, 1, 1), spacing=0), "spacing"),

@@ -52,6 +52,15 @@ def test_eight_and_sixteen_bit_grey_and_alpha(tmp_path, name, channels, kind, to
         np.testing.assert_allclose(exemplar, wanted, atol=tolerance + 1e-6)
 
 
+def test_colours_are_not_multiplied_by_alpha(tmp_path):
+    pixels = np.full((64, 64, 4), 200 / 255, np.float32)
+    pixels[..., 3] = 128 / 255
+    image = oiio.ImageBuf(pixels)
+    image.specmod().attribute("oiio:UnassociatedAlpha", 1)
+    assert image.write(os.fspath(tmp_path / "rgba.png"), oiio.UINT8)
+    assert read_exemplar(tmp_path / "rgba.png", 64)[0, 0, 0] == pytest.approx(200 / 255, abs=1 / 255)
+
+
 def test_cmyk_is_converted(tmp_path):
     image = oiio.ImageBuf(oiio.ImageSpec(80, 80, 4, "uint8"))
     oiio.ImageBufAlgo.fill(image, (0.0, 1.0, 1.0, 0.0))  # no cyan, all magenta and yellow, no black: red

@@ -17,10 +17,10 @@ import torch
 from solidgrain.export.from_run import check_agreement, export_run, sampler_weights
 from solidgrain.runtime import BundleError, TrainingError, load
 from solidgrain.train.exemplar import read_exemplar
-from solidgrain.train.loop import Budget, train
-from solidgrain.train.run import create_run, open_run
+from solidgrain.train.loop import train
+from solidgrain.train.run import Source, create_run, open_run
 from solidgrain.train.sampler import Sampler
-from solidgrain.train.settings import preset
+from solidgrain.train.settings import Budget, preset
 
 TINY = {
     "octaves": 4,
@@ -42,7 +42,9 @@ def one_thread():
 
 def new_run(folder, photograph, **changes):
     settings = preset("fast", **{**TINY, **changes})
-    return create_run(folder, settings, read_exemplar(photograph, settings.patch), photograph.name, "CC0-1.0", "nobody")
+    return create_run(
+        folder, settings, read_exemplar(photograph, settings.patch), Source(photograph.name, "CC0-1.0", "nobody"), Budget()
+    )
 
 
 def losses(folder):
@@ -232,12 +234,15 @@ def test_the_command_line_trains_and_exports(solidgrain, tmp_path, photograph):
 @pytest.mark.parametrize(
     ("flags", "code", "message"),
     [
-        (["--iterations", "0"], 1, "--iterations 0"),
-        (["--minutes", "-1"], 1, "--minutes"),
-        (["--minutes", "nan"], 1, "--minutes"),
-        (["--patch", "8"], 1, "--patch 8"),
+        (["--iterations", "0"], 2, "--iterations"),
+        (["--minutes", "-1"], 2, "--minutes"),
+        (["--minutes", "nan"], 2, "--minutes"),
+        (["--minutes", "inf"], 2, "--minutes"),
+        (["--seed", "1" + 25 * "0"], 2, "--seed"),
+        (["--threads", "-5"], 2, "--threads"),
+        (["--patch", "8"], 2, "--patch 8"),
         (["--patch", "81"], 1, "expected at least 81x81"),
-        (["--batch", "0"], 1, "--batch 0"),
+        (["--batch", "0"], 2, "--batch"),
         (["--preset", "slow"], 2, "--preset"),
         (["--anisotropic", "z"], 2, "--anisotropic"),
     ],
@@ -255,6 +260,66 @@ def test_cuda_without_a_device_is_an_error_not_a_fall_back(solidgrain, tmp_path,
     assert outcome.code == 1
     assert "sees no CUDA device" in outcome.error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_resuming_keeps_the_run_s_budget_and_refuses_other_settings(solidgrain, tmp_path, photograph):
+    folder = tmp_path / "run"
+    flags = ["--patch", 32, "--batch", 1, "--threads", 1]
+    assert solidgrain("train", photograph, "--out", folder, "--iterations", 2, *flags).code == 0
+    assert open_run(folder).budget == Budget(iterations=2)
+    assert solidgrain("train", "--resume", folder, "--threads", 1).code == 0  # spent: nothing to do
+    assert open_run(folder).load_checkpoint()["iteration"] == 2
+    refused = solidgrain("train", "--resume", folder, "--patch", 64, "--seed", 9)
+    assert refused.code == 2
+    assert "--patch, --seed" in refused.error
+    assert solidgrain("train", photograph, "--resume", folder).code == 2
+    assert solidgrain("train", "--out", tmp_path / "other").code == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("options.json", b"{}", "damaged run directory"),
+        ("options.json", b"hello", "damaged run directory"),
+        ("exemplar.npy", b"", "damaged run directory"),
+        ("exemplar.npy", None, "damaged run directory"),
+        ("checkpoint.pt", b"", "damaged checkpoint"),
+    ],
+)
+def test_a_damaged_run_is_refused_in_one_line(solidgrain, tmp_path, photograph, name, content, message):
+    folder = tmp_path / "run"
+    new_run(folder, photograph)
+    if content is None:
+        (folder / name).unlink()
+    else:
+        (folder / name).write_bytes(content)
+    outcome = solidgrain("train", "--resume", folder, "--iterations", 1, "--threads", 1)
+    assert outcome.code == 1
+    assert message in outcome.error
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path, photograph):
+    train(new_run(tmp_path / "small", photograph), Budget(iterations=1), CPU)
+    large = new_run(tmp_path / "large", photograph, width=48)
+    (large.folder / "checkpoint.pt").write_bytes((tmp_path / "small" / "checkpoint.pt").read_bytes())
+    for use in (lambda: train(large, Budget(iterations=2), CPU), lambda: export_run(large.folder, tmp_path / "bundle")):
+        with pytest.raises(TrainingError, match="does not fit"):
+            use()
+
+
+def test_a_full_disk_keeps_the_checkpoint_and_says_how_to_go_on(tmp_path, photograph, monkeypatch):
+    run = new_run(tmp_path / "run", photograph)
+    train(run, Budget(iterations=1), CPU)
+    before = (run.folder / "checkpoint.pt").read_bytes()
+
+    def full(number):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(TrainingError, match=r"No space left on device.*--resume"):
+        train(run, Budget(iterations=2), CPU)
+    assert (run.folder / "checkpoint.pt").read_bytes() == before
+    assert not list(run.folder.glob(".*tmp*"))
 
 
 def test_an_existing_run_is_not_overwritten(solidgrain, whole, photograph):

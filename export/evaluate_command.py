@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from solidgrain.bake.arguments import parse_count, parse_positive
+
 if TYPE_CHECKING:
     from solidgrain.train.quality import Evaluation
 
@@ -16,8 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("source", metavar="SOURCE", help="embedded name, bundle or texture file")
     add("--exemplar", type=Path, required=True, metavar="PHOTO", help="the photograph that it was trained on")
-    add("--slices", type=int, default=50, metavar="N", help="axis-aligned and oblique slices, one instance each (50)")
-    add("--threads", type=int, default=0, metavar="N", help="0: every processor that the process may use (0)")
+    add(
+        "--slices", type=parse_positive, default=50, metavar="N", help="axis-aligned and oblique slices, one instance each (50)"
+    )
+    add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
     add("--json", action="store_true", help="print one JSON object on stdout")
     add("--card", action="store_true", help="write the table into the bundle's model card")
 
@@ -28,12 +32,13 @@ def run(arguments: argparse.Namespace) -> int:
     from solidgrain.export.card import with_quality
     from solidgrain.runtime import load
     from solidgrain.runtime.bundle import CARD
+    from solidgrain.runtime.files import replacing
     from solidgrain.train.exemplar import read_exemplar
-    from solidgrain.train.quality import evaluate
+    from solidgrain.train.quality import SMALLEST, evaluate
 
     texture = load(arguments.source, threads=arguments.threads)
     manifest = texture.bundle.manifest
-    exemplar = read_exemplar(arguments.exemplar, manifest["patch"])
+    exemplar = read_exemplar(arguments.exemplar, SMALLEST)
     grain = manifest["training"].get("settings", {}).get("grain", "none")
     print(f"measuring {2 * arguments.slices} slices of {texture.name}", file=sys.stderr)
     evaluation = evaluate(exemplar, texture.sample, arguments.slices, grain)
@@ -41,7 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.card:
         card = texture.bundle.folder / CARD
         written = card.read_text("utf-8") if card.is_file() else f"# {texture.name}\n"
-        card.write_text(with_quality(written, table(evaluation)), "utf-8")
+        with replacing(card) as file:
+            file.write(with_quality(written, table(evaluation)).encode())
     return 0
 
 

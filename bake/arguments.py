@@ -1,0 +1,67 @@
+"""Types of command-line arguments. Each says what it expected and what it found."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+
+def parse_size(text: str) -> tuple[int, int, int]:
+    """ "128" or "256x128x64" (x, y, z)."""
+    parts = text.replace(",", "x").split("x")
+    numbers = [int(part) if part.isdecimal() else 0 for part in (parts * 3 if len(parts) == 1 else parts)]
+    if len(numbers) != 3 or min(numbers) < 1:
+        raise argparse.ArgumentTypeError(f"expected N or XxYxZ, whole numbers above 0, found {text!r}")
+    return (numbers[0], numbers[1], numbers[2])
+
+
+def parse_vector(text: str) -> tuple[float, float, float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+        raise argparse.ArgumentTypeError(f"expected X,Y,Z, three numbers, found {text!r}")
+    return (numbers[0], numbers[1], numbers[2])
+
+
+def parse_spacing(text: str) -> tuple[float, float, float]:
+    """One number for all axes, or X,Y,Z."""
+    spacing = parse_vector(text if "," in text else ",".join([text] * 3))
+    if min(spacing) <= 0:
+        raise argparse.ArgumentTypeError(f"expected exemplar pixels per voxel, above 0, found {text!r}")
+    return spacing
+
+
+def parse_tile(text: str) -> str:
+    if not set(text) <= set("xyz") or len(set(text)) != len(text):
+        raise argparse.ArgumentTypeError(f"expected each of x, y, z at most once, found {text!r}")
+    return "".join(sorted(text))
+
+
+def parse_count(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, found {text!r}")
+    return int(text)
+
+
+def parse_seed(text: str) -> int:
+    if not text.isdecimal() or int(text) >= 2**64:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to 2^64 - 1, found {text!r}")
+    return int(text)
+
+
+def parse_positive(text: str) -> int:
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, found {text!r}")
+    return int(text)
+
+
+def parse_minutes(text: str) -> float:
+    try:
+        minutes = float(text)
+    except ValueError:
+        minutes = 0.0
+    if not 0 < minutes < math.inf:
+        raise argparse.ArgumentTypeError(f"expected minutes above 0, found {text!r}")
+    return minutes
