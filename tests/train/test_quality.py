@@ -50,3 +50,28 @@ def test_a_grain_limits_the_orientations(monkeypatch):
     for points in seen:
         along = points[:, 1:] - points[:, :-1]
         np.testing.assert_allclose(along, np.broadcast_to([1.0, 0, 0], along.shape), atol=1e-4)
+
+
+def test_the_command_measures_a_bundle_and_writes_its_card(solidgrain, toy_folder, tmp_path):
+    import shutil
+
+    import OpenImageIO as oiio
+
+    folder = shutil.copytree(toy_folder, tmp_path / "toy")
+    oiio.ImageBuf(EXEMPLAR).write(str(tmp_path / "exemplar.png"), oiio.UINT8)
+    outcome = solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
+    assert outcome.code == 0, outcome.err
+    assert "| vgg_frechet |" in outcome.out
+    assert outcome.out.strip() in (folder / "card.md").read_text()
+    solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
+    assert (folder / "card.md").read_text().count("## Quality") == 1
+
+
+@pytest.mark.parametrize(("flags", "code", "message"), [(["--slices", "0"], 2, "--slices"), ([], 1, "at least 64x64")])
+def test_the_command_refuses_what_it_cannot_measure(solidgrain, toy_folder, tmp_path, flags, code, message):
+    import OpenImageIO as oiio
+
+    oiio.ImageBuf(np.ascontiguousarray(EXEMPLAR[:40, :40])).write(str(tmp_path / "small.png"), oiio.UINT8)
+    outcome = solidgrain("evaluate", toy_folder, "--exemplar", tmp_path / "small.png", *flags)
+    assert outcome.code == code
+    assert message in outcome.err
