@@ -86,9 +86,8 @@ class Trainer:
         """A batch of random slices of one fresh noise instance, as images."""
         settings = self.settings
         tables = draw_tables(settings.octaves, settings.resolution, self.generator)
-        points = draw_slices(
-            settings, self.generator
-        )  # outside autocast: coordinates in bfloat16 are off by a tenth of a pixel
+        # Outside autocast: coordinates in bfloat16 are off by a tenth of a pixel.
+        points = draw_slices(settings, self.generator)
         with self._autocast():
             rgb: Tensor = self.sampler(tables, points)
         return rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
