@@ -21,7 +21,7 @@ from solidgrain.runtime.bundle import CARD, FORMAT, FORMAT_VERSION, MANIFEST, SA
 from solidgrain.runtime.errors import BundleError
 from solidgrain.runtime.files import sync
 from solidgrain.runtime.lattice import untiled
-from solidgrain.runtime.noise import noise_tables
+from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.texture_file import TextureData, write_texture
 
 FloatArray = npt.NDArray[np.float32]
@@ -131,7 +131,7 @@ def run_graph(model: onnx.ModelProto, texture: TextureData, points: DoubleArray,
     feed = {
         **texture.arrays(),
         "points": points,
-        "offsets": np.zeros((octaves, 3)),
+        "offsets": noise_offsets(seed, octaves),
         "lattice": untiled(texture.transforms).lattice,
         "noise": noise_tables(seed, octaves),
     }

@@ -13,7 +13,7 @@ from solidgrain.export.bundle import Details, DoubleArray, SamplerWeights, run_g
 from solidgrain.export.card import write_card
 from solidgrain.export.sampler_graph import build_sampler_graph
 from solidgrain.runtime.errors import TrainingError
-from solidgrain.runtime.noise import noise_tables
+from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.run import Run, open_run
 from solidgrain.train.sampler import Sampler
@@ -76,6 +76,7 @@ def check_agreement(sampler: Sampler, weights: SamplerWeights, seed: int = 1) ->
     model = build_sampler_graph(weights.weights, weights.biases, octaves)
     exact, tables = copy.deepcopy(sampler).double(), torch.from_numpy(noise_tables(seed, octaves)).double()
     points = _random_points(seed)
+    exact.offsets = torch.from_numpy(noise_offsets(seed, octaves))
     expected = exact(tables, torch.from_numpy(points / UNIT)[None])[0].numpy()
     worst = float(np.abs(run_graph(model, texture, points, seed) - expected).max())
     if not worst <= TOLERANCE:

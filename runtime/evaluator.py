@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from solidgrain.runtime.errors import EvaluationError
 from solidgrain.runtime.lattice import Tiling
-from solidgrain.runtime.noise import noise_tables
+from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.texture_file import TextureData
 
 if TYPE_CHECKING:
@@ -36,12 +36,12 @@ class Instance:
         octaves = len(tiling.transforms)
         inputs = {
             "transforms": tiling.transforms,
-            "offsets": np.zeros((octaves, 3)),
             "lattice": tiling.lattice,
             "gamma": texture.gamma,
             "delta": texture.delta,
             "noise_weights": texture.noise_weights,
-            "noise": noise_tables(seed, octaves),
+            "noise": noise_tables(seed, octaves),  # checks the seed
+            "offsets": noise_offsets(seed, octaves),
         }
         place = onnxruntime.OrtValue.ortvalue_from_numpy
         self.inputs = {name: place(np.ascontiguousarray(value), device) for name, value in inputs.items()}

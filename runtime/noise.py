@@ -37,6 +37,16 @@ def noise_tables(seed: int, octaves: int) -> FloatArray:
     return tables.reshape(octaves, RESOLUTION, RESOLUTION, RESOLUTION)
 
 
+def noise_offsets(seed: int, octaves: int) -> npt.NDArray[np.float64]:
+    """Where the origin lies in each octave's table, [octaves, 3] texels in [0, 64), from the key (seed, 2^32 + i).
+
+    Without them every octave would have a texel exactly at the origin, where noise is strongest (between texels it averages),
+    and every bake would start with a blemish in its corner.
+    """
+    words = [np.random.Philox(key=np.array([seed, 2**32 + octave], np.uint64)).random_raw(3) for octave in range(octaves)]
+    return (np.array(words) >> np.uint64(11)).astype(np.float64) * (RESOLUTION * 2.0**-53)
+
+
 @cache
 def _quantiles() -> FloatArray:
     """Quantile (k + 0.5) / 65 536 of the standard normal for k = 0 .. 65 535.

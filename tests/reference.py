@@ -10,9 +10,10 @@ import numpy as np
 from solidgrain.export.bundle import SamplerWeights
 
 
-def color(weights: SamplerWeights, tables: np.ndarray, point: tuple[float, float, float]) -> np.ndarray:
+def color(weights: SamplerWeights, tables: np.ndarray, offsets: np.ndarray, point: tuple[float, float, float]) -> np.ndarray:
     """RGB at one point (x, y, z) in exemplar pixels, not clipped, without tiling."""
-    eta = [noise(table, locate(transform, point)) for table, transform in zip(tables, weights.transforms, strict=True)]
+    octaves = zip(tables, weights.transforms, offsets, strict=True)
+    eta = [noise(table, locate(transform, point, offset)) for table, transform, offset in octaves]
     bins = np.array(eta).reshape(4, -1)
     x = None
     for layer, bias in enumerate(weights.biases[:-1]):
@@ -26,11 +27,12 @@ def color(weights: SamplerWeights, tables: np.ndarray, point: tuple[float, float
     return np.asarray(x @ weights.weights[-1] + weights.biases[-1])
 
 
-def locate(transform: np.ndarray, point: tuple[float, float, float]) -> list[Fraction]:
-    """T p without any rounding."""
+def locate(transform: np.ndarray, point: tuple[float, float, float], offset: np.ndarray | None = None) -> list[Fraction]:
+    """T p + o without any rounding."""
+    start = [0.0, 0.0, 0.0] if offset is None else offset
     return [
-        sum((Fraction(float(t)) * Fraction(float(p)) for t, p in zip(row, point, strict=True)), Fraction(0))
-        for row in transform
+        sum((Fraction(float(t)) * Fraction(float(p)) for t, p in zip(row, point, strict=True)), Fraction(float(first)))
+        for row, first in zip(transform, start, strict=True)
     ]
 
 

@@ -29,6 +29,7 @@ class Sampler(nn.Module):
         noise_weights = torch.randn(shape, generator=generator, device=generator.device)
         self.noise_weights = nn.Parameter(settings.noise_weight_start * noise_weights)  # A of Eq. 2, transposed
         self.output = Linear(m, 3, generator, gain=1.0)
+        self.offsets: Tensor | None = None  # [n, 3] texels; training shifts its slices at random instead
 
     def transforms(self) -> Tensor:
         """T_i [n, 3, 3], on coordinates in units of 64 pixels."""
@@ -36,7 +37,7 @@ class Sampler(nn.Module):
 
     def forward(self, tables: Tensor, points: Tensor) -> Tensor:
         """Colour at points: tables [n, R, R, R], points [B, P, 3] -> rgb [B, P, 3], not clipped to [0, 1]."""
-        eta = look_up(tables, self.transforms(), points)  # (B, P, n)
+        eta = look_up(tables, self.transforms(), points, self.offsets)  # (B, P, n)
         bins = eta.chunk(BINS, dim=-1)
         x: Tensor = self.constant
         for layer, dense in enumerate(self.hidden):
