@@ -67,6 +67,12 @@ def assert_same_checkpoint(first, second):
     assert [name for name in a if not torch.equal(a[name], b[name])] == []
 
 
+def endless_training(folder):
+    """A run going on in a process of its own, for stopping."""
+    flags = ["train", "--resume", str(folder), "--threads", "1", "--iterations", "10000"]
+    return subprocess.Popen([sys.executable, "-m", "solidgrain.bake.cli", *flags], stderr=subprocess.PIPE, text=True)
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, photograph):
     """Ten iterations in one go."""
@@ -99,25 +105,13 @@ def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, photograph):
     """Signal 9 in the middle, after the first checkpoint: statistics past it are rewound and written again."""
     folder = tmp_path / "killed"
     new_run(folder, photograph)
-    command = [
-        sys.executable,
-        "-m",
-        "solidgrain.bake.cli",
-        "train",
-        "--resume",
-        str(folder),
-        "--threads",
-        "1",
-        "--iterations",
-        "10000",
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    process = endless_training(folder)
     deadline = time.monotonic() + 120
     while not (folder / "checkpoint.pt").exists() and time.monotonic() < deadline:
         time.sleep(0.02)
     time.sleep(0.3)
     process.kill()
-    process.wait()
+    process.communicate()
     further = Budget(iterations=open_run(folder).load_checkpoint()["iteration"] + 3)
     train(open_run(folder), further, CPU)
     train(new_run(tmp_path / "whole", photograph), further, CPU)
@@ -196,19 +190,7 @@ def test_a_diverging_run_says_so_and_keeps_its_last_checkpoint(tmp_path, photogr
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, photograph):
     folder = tmp_path / "run"
     new_run(folder, photograph)
-    command = [
-        sys.executable,
-        "-m",
-        "solidgrain.bake.cli",
-        "train",
-        "--resume",
-        str(folder),
-        "--threads",
-        "1",
-        "--iterations",
-        "10000",
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    process = endless_training(folder)
     deadline = time.monotonic() + 120
     while not (folder / "stats.jsonl").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
