@@ -1,14 +1,15 @@
-"""Running a plan: slabs are evaluated in order and handed to every writer."""
+"""Running a plan: slabs are evaluated in order and handed to every writer, one slab ahead of them."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from solidgrain.bake.plan import Plan
-from solidgrain.bake.writers import Writer, open_writer
+from solidgrain.bake.writers import FloatArray, Writer, open_writer
 from solidgrain.runtime import Texture
 from solidgrain.runtime.errors import BakeError
 
@@ -34,7 +35,7 @@ def bake(plan: Plan, texture: Texture, on_slice: OnSlice = lambda done, total: N
     started = time.monotonic()
     try:
         for output in plan.outputs:
-            writers.append(open_writer(output, plan.volume, texture.threads))
+            writers.append(open_writer(output, plan.volume, texture.workers))
         evaluation = _feed(plan, texture, writers, on_slice)
         for writer in writers:
             writer.finish()
@@ -53,14 +54,31 @@ def _culprit(error: OSError, plan: Plan) -> str:
 
 
 def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], on_slice: OnSlice) -> float:
-    """All slabs to all writers. Returns the seconds spent in the sampler."""
-    volume, evaluation, waiting_since = plan.volume, 0.0, time.monotonic()
-    slabs = texture.slabs(volume.shape, plan.seed, origin=plan.origin, spacing=plan.spacing, tile=plan.tile, slab=plan.slab)
-    for z, slab in slabs:
-        evaluation += time.monotonic() - waiting_since
+    """All slabs to all writers: one slab is written while the next is evaluated. Returns the seconds spent in the sampler."""
+    depth, evaluation = plan.volume.shape[0], 0.0
+    writing: Future[None] | None = None
+
+    def write(z: int, slab: FloatArray) -> None:
         for writer in writers:
             writer.write(z, slab)
-        on_slice(z + len(slab), volume.shape[0])
-        del slab  # or it would live while the next one is made
-        waiting_since = time.monotonic()
+        on_slice(z + len(slab), depth)
+
+    with ThreadPoolExecutor(1, thread_name_prefix="solidgrain-writers") as hand:
+        try:
+            waiting_since = time.monotonic()
+            slabs = texture.slabs(
+                plan.volume.shape, plan.seed, origin=plan.origin, spacing=plan.spacing, tile=plan.tile, slab=plan.slab
+            )
+            for z, slab in slabs:
+                evaluation += time.monotonic() - waiting_since
+                if writing is not None:
+                    writing.result()
+                writing = hand.submit(write, z, slab)
+                del slab  # or it would live while the next but one is made
+                waiting_since = time.monotonic()
+            if writing is not None:
+                writing.result()
+        except BaseException:
+            texture.workers.cancel()  # what the writers are waiting for
+            raise
     return evaluation

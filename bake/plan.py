@@ -25,6 +25,7 @@ class Plan:
     source: str
     texture: str  # name of the texture
     sampler_sha256: str
+    precision: str
     seed: int
     size: tuple[int, int, int]  # voxels
     origin: tuple[float, float, float]  # exemplar pixels

@@ -14,7 +14,12 @@ if TYPE_CHECKING:
     import onnxruntime
 
 SUFFIX = "ExecutionProvider"
-OPTIONS: dict[str, dict[str, Any]] = {"CUDAExecutionProvider": {"use_tf32": 0}}  # TF32 costs visible precision
+ALIASES = {"directml": "dml"}
+OPTIONS: dict[str, dict[str, Any]] = {  # float32 means float32: TF32 and bfloat16 cost visible precision
+    "CUDAExecutionProvider": {"use_tf32": 0},
+    "OpenVINOExecutionProvider": {"device_type": "CPU", "precision": "FP32"},
+}
+DEVICES = {"CUDAExecutionProvider": "cuda", "TensorrtExecutionProvider": "cuda", "DmlExecutionProvider": "dml"}
 
 
 def available_providers() -> list[str]:
@@ -22,6 +27,11 @@ def available_providers() -> list[str]:
     import onnxruntime
 
     return [name.removesuffix(SUFFIX).lower() for name in onnxruntime.get_available_providers() if name.endswith(SUFFIX)]
+
+
+def memory_device(full_name: str) -> str:
+    """Where a provider wants its inputs, as ONNX Runtime names devices: "cuda", "dml", or "cpu" for all others."""
+    return DEVICES.get(full_name, "cpu")
 
 
 def usable_threads() -> int:
@@ -44,20 +54,22 @@ def check_inputs(session: onnxruntime.InferenceSession, texture: TextureData, pa
 def open_session(path: Path, provider: str) -> onnxruntime.InferenceSession:
     """A session on one graph, running on the named provider and on no other.
 
-    One thread per run: the evaluator runs chunks side by side, which needs no synchronisation inside the graph. Raises
+    One thread per run: chunks run side by side, which needs no synchronisation inside the graph. Raises
     ProviderError if the provider cannot be had, BundleError if the graph cannot be loaded.
     """
     import onnxruntime
 
     offered = {name.removesuffix(SUFFIX).lower(): name for name in onnxruntime.get_available_providers()}
-    full_name = offered.get(provider.lower())
+    full_name = offered.get(ALIASES.get(provider.lower(), provider.lower()))
     if full_name is None:
         raise ProviderError(
-            f"provider {provider!r}: not available in onnxruntime {onnxruntime.__version__}, which has {', '.join(offered)}; "
-            "install the matching onnxruntime package (and only one of them)"
+            f"provider {provider!r}: expected auto, kernel, or one that onnxruntime {onnxruntime.__version__} has: "
+            f"{', '.join(offered)}; for others install the matching onnxruntime package (and only one of them)"
         )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
+    if full_name == "DmlExecutionProvider":  # documented requirement of DirectML
+        options.enable_mem_pattern = False
     options.log_severity_level = 3  # errors; they arrive as exceptions as well
     try:
         session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=[(full_name, OPTIONS.get(full_name, {}))])

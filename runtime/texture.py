@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import operator
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.runtime import evaluator
 from solidgrain.runtime.bundle import (
     MANIFEST,
-    SAMPLER,
     TEXTURE,
     Bundle,
     embedded_folder,
@@ -22,15 +20,15 @@ from solidgrain.runtime.bundle import (
     find_bundle,
     open_bundle,
 )
+from solidgrain.runtime.engine import Engine, Instance, open_engine
 from solidgrain.runtime.errors import BundleError, EvaluationError
 from solidgrain.runtime.lattice import Tiling, tiled, untiled
-from solidgrain.runtime.provider import check_inputs, open_session, usable_threads
+from solidgrain.runtime.provider import usable_threads
 from solidgrain.runtime.texture_file import TextureData, read_texture, write_texture
-
-if TYPE_CHECKING:
-    import onnxruntime
+from solidgrain.runtime.workers import Workers
 
 FloatArray = npt.NDArray[np.float32]
+DoubleArray = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 DEFAULT_TEXTURE = "granite"
@@ -42,20 +40,22 @@ def load(
     source: str | os.PathLike[str] = DEFAULT_TEXTURE,
     *,
     bundle: str | os.PathLike[str] | None = None,
-    provider: str = "cpu",
+    provider: str = "auto",
+    precision: str = "float32",
     threads: int = 0,
 ) -> Texture:
     """Load a texture by embedded name, from a bundle folder, or from a saved texture file.
 
-    `bundle` names the bundle of a texture file that neither lies in it nor belongs to an embedded one. `provider` is an
-    ONNX Runtime execution provider by its short name ("cpu", "cuda"); one that cannot be had is an error. `threads` of 0
-    uses every processor that this process may use. Raises BundleError or ProviderError.
+    `bundle` names the bundle of a texture file that neither lies in it nor belongs to an embedded one. `provider` "auto" is
+    the fused kernel, or ONNX Runtime on the CPU where there is no kernel for this machine or bundle (`Texture.provider` and
+    `provider_note` say which and why); "kernel" insists; "cpu", "cuda", "directml", "coreml", "openvino" are ONNX Runtime's
+    execution providers. One that cannot be had is an error. `precision` "bfloat16" is faster where the processor has AMX,
+    and an error elsewhere. `threads` of 0 uses every processor that this process may use. Raises BundleError or ProviderError.
     """
     data, owner = _resolve(os.fspath(source), None if bundle is None else Path(bundle))
     (count,) = _whole("threads", (threads,), count=1, least=0)
-    session = open_session(owner.folder / SAMPLER, provider)
-    check_inputs(session, data, owner.folder / SAMPLER)
-    return Texture(data, owner, session, count or usable_threads())
+    engine, note = open_engine(owner, data, provider.lower(), precision)
+    return Texture(data, owner, engine, Workers(count or usable_threads()), note)
 
 
 def _resolve(source: str, bundle: Path | None) -> tuple[TextureData, Bundle]:
@@ -91,10 +91,10 @@ def _matching(data: TextureData, owner: Bundle) -> tuple[TextureData, Bundle]:
 class Texture:
     """A solid texture: colour at every point of space, in endless instances, one per seed. Made by `load`."""
 
-    def __init__(self, data: TextureData, bundle: Bundle, session: onnxruntime.InferenceSession, threads: int) -> None:
-        self.data, self.bundle, self.threads = data, bundle, threads
-        self._session = session
-        self._last: tuple[object, evaluator.Instance] | None = None
+    def __init__(self, data: TextureData, bundle: Bundle, engine: Engine, workers: Workers, provider_note: str = "") -> None:
+        self.data, self.bundle, self.workers, self.provider_note = data, bundle, workers, provider_note
+        self._engine = engine
+        self._last: tuple[object, Instance] | None = None
 
     @property
     def name(self) -> str:
@@ -102,8 +102,16 @@ class Texture:
 
     @property
     def provider(self) -> str:
-        """The ONNX Runtime execution provider that runs it."""
-        return str(self._session.get_providers()[0])
+        """What evaluates it: a path of the fused kernel ("kernel:avx512") or an ONNX Runtime execution provider."""
+        return self._engine.name
+
+    @property
+    def precision(self) -> str:
+        return self._engine.precision
+
+    @property
+    def threads(self) -> int:
+        return self.workers.count
 
     @property
     def transforms(self) -> npt.NDArray[np.float64]:
@@ -113,17 +121,29 @@ class Texture:
     def sample(self, points: npt.ArrayLike, seed: int = 0) -> FloatArray:
         """Colour at points [P, 3] (x, y, z) in exemplar pixels -> [P, 3] float32 in [0, 1], sRGB-encoded.
 
-        Raises EvaluationError for points of another shape or that are not finite.
+        A point that is NaN, infinite or beyond 2^40 pixels has the colour NaN, and a RuntimeWarning counts them. Raises
+        EvaluationError for points of another shape.
         """
         try:
-            coordinates = np.asarray(points, np.float64)
+            coordinates = np.ascontiguousarray(points, np.float64)
         except (TypeError, ValueError) as error:
             raise EvaluationError(f"points are not numbers ({error}), expected [P, 3] (x, y, z)") from error
-        if coordinates.ndim != 2 or coordinates.shape[1] != 3:
-            raise EvaluationError(f"points have shape {coordinates.shape}, expected [P, 3] (x, y, z)")
-        if not (np.abs(coordinates) <= FARTHEST).all():
-            raise EvaluationError(f"points hold NaN or infinity, or lie beyond {FARTHEST:g}; expected finite exemplar pixels")
-        return evaluator.evaluate_points(self._instance(untiled(self.transforms), seed), coordinates, self.threads)
+        if np.shape(points) != coordinates.shape or coordinates.ndim != 2 or coordinates.shape[1] != 3:
+            raise EvaluationError(f"points have shape {np.shape(points)}, expected [P, 3] (x, y, z)")
+        nowhere = np.flatnonzero(~(np.abs(coordinates) <= FARTHEST).all(axis=1))
+        if nowhere.size:
+            coordinates = coordinates.copy()
+            coordinates[nowhere] = 0.0
+        rgb = np.empty((len(coordinates), 3), np.float32)
+        self.workers.run(self._instance(untiled(self.transforms), seed).point_tasks(coordinates, rgb))
+        if nowhere.size:
+            rgb[nowhere] = np.nan
+            warnings.warn(
+                f"{nowhere.size} of {len(rgb)} points are NaN, infinite or beyond {FARTHEST:g} pixels; their colour is NaN",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return rgb
 
     def grid(
         self,
@@ -176,10 +196,12 @@ class Texture:
             tiling.wrap(start[axis] + (np.arange(count, dtype=np.float64) + 0.5) * step[axis], axis)
             for axis, count in enumerate((columns, rows, depth))
         )
-        return (
-            (first, evaluator.evaluate_lattice(instance, x, y, z[first : first + thickness], self.threads))
-            for first in range(0, depth, thickness)
-        )
+        return ((first, self._slab(instance, x, y, z[first : first + thickness])) for first in range(0, depth, thickness))
+
+    def _slab(self, instance: Instance, x: DoubleArray, y: DoubleArray, z: DoubleArray) -> FloatArray:
+        rgb = np.empty((len(z), len(y), len(x), 3), np.float32)
+        self.workers.run(instance.grid_tasks(x, y, z, rgb))
+        return rgb
 
     def tiling(
         self,
@@ -198,7 +220,7 @@ class Texture:
         """Save the texture alone (~25 KB); it loads wherever its bundle can be found."""
         write_texture(Path(path), self.data)
 
-    def _instance(self, tiling: Tiling, seed: int) -> evaluator.Instance:
+    def _instance(self, tiling: Tiling, seed: int) -> Instance:
         """The instance of a seed; the last one is kept, so that point after point is cheap."""
         try:
             number = operator.index(seed)
@@ -206,7 +228,7 @@ class Texture:
             raise EvaluationError(f"seed {seed!r}: expected a whole number from 0 to 2^64 - 1") from error
         key = (number, tiling.transforms.tobytes(), tiling.lattice.tobytes())
         if self._last is None or self._last[0] != key:
-            self._last = (key, evaluator.Instance(self._session, self.data, tiling, number))
+            self._last = (key, self._engine.instance(tiling, number))
         return self._last[1]
 
 

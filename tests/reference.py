@@ -8,12 +8,20 @@ from fractions import Fraction
 import numpy as np
 
 from solidgrain.export.bundle import SamplerWeights
+from solidgrain.runtime.lattice import Tiling, untiled
 
 
-def color(weights: SamplerWeights, tables: np.ndarray, offsets: np.ndarray, point: tuple[float, float, float]) -> np.ndarray:
-    """RGB at one point (x, y, z) in exemplar pixels, not clipped, without tiling."""
-    octaves = zip(tables, weights.transforms, offsets, strict=True)
-    eta = [noise(table, locate(transform, point, offset)) for table, transform, offset in octaves]
+def color(
+    weights: SamplerWeights,
+    tables: np.ndarray,
+    offsets: np.ndarray,
+    point: tuple[float, float, float],
+    tiling: Tiling | None = None,
+) -> np.ndarray:
+    """RGB at one point (x, y, z) in exemplar pixels, not clipped."""
+    tiling = tiling or untiled(weights.transforms)
+    octaves = zip(tables, tiling.transforms, offsets, tiling.lattice, strict=True)
+    eta = [noise(table, locate(transform, point, offset), basis) for table, transform, offset, basis in octaves]
     bins = np.array(eta).reshape(4, -1)
     x = None
     for layer, bias in enumerate(weights.biases[:-1]):
@@ -36,12 +44,23 @@ def locate(transform: np.ndarray, point: tuple[float, float, float], offset: np.
     ]
 
 
-def noise(table: np.ndarray, at: list[Fraction]) -> float:
-    """Trilinear lookup in a table that repeats after 64 texels."""
+def noise(table: np.ndarray, at: list[Fraction], basis: np.ndarray = 64 * np.eye(3)) -> float:  # noqa: B008
+    """Trilinear lookup in a table that repeats on a lattice."""
     cells = [math.floor(coordinate) for coordinate in at]
     fractions = [float(coordinate - cell) for coordinate, cell in zip(at, cells, strict=True)]
     value = 0.0
     for corner in np.ndindex(2, 2, 2):
         share = math.prod(f if end else 1 - f for f, end in zip(fractions, corner, strict=True))
-        value += share * table[tuple((cell + end) % 64 for cell, end in zip(cells, corner, strict=True))]
+        value += share * table.flat[texel([cell + end for cell, end in zip(cells, corner, strict=True)], basis)]
     return value
+
+
+def texel(cell: list[int], basis: np.ndarray) -> int:
+    """The number of a cell's canonical representative, in mixed radix, modulo 64^3 (`solidgrain.runtime.lattice`)."""
+    number = 0
+    for axis in range(3):
+        pivot = int(basis[axis, axis])
+        turns = cell[axis] // pivot
+        cell = [entry - turns * int(step) for entry, step in zip(cell, basis[:, axis], strict=True)]
+        number = number * pivot + cell[axis]
+    return number % 64**3

@@ -34,6 +34,7 @@ def diagnose() -> dict[str, Any]:
         "packages": {name: _version(name) for name in PACKAGES},
         "threads": {"usable": usable_threads(), "processors": os.cpu_count()},
         "onnxruntime_builds": _onnxruntime_builds(problems),
+        "kernel": _kernel(),
         "providers": _providers(problems),
         "textures": _textures(problems),
         "opengl": _opengl(),
@@ -55,6 +56,17 @@ def _onnxruntime_builds(problems: list[str]) -> list[str]:
     if len(builds) > 1:
         problems.append(f"{' and '.join(builds)} are installed together; uninstall all of them, then install one")
     return builds
+
+
+def _kernel() -> dict[str, Any]:
+    """The fused kernel: the paths that run here and the one that is used, or why there is none. It may be missing."""
+    from solidgrain.runtime import ProviderError, load
+    from solidgrain.runtime.kernel import kernel_paths
+
+    try:
+        return {"paths": list(kernel_paths()), "used": load(provider="kernel").provider}
+    except ProviderError as error:
+        return {"paths": [], "used": None, "reason": str(error)}
 
 
 def _providers(problems: list[str]) -> dict[str, str]:
@@ -102,6 +114,12 @@ def _opengl() -> str:
     return "works" if reason is None else f"{reason}; {REMEDY}"
 
 
+def _kernel_line(kernel: dict[str, Any]) -> str:
+    if kernel["used"] is None:
+        return f"{kernel['reason']}; textures are evaluated by ONNX Runtime"
+    return f"{kernel['used']} is used, of {', '.join(kernel['paths'])}"
+
+
 def summary(report: dict[str, Any]) -> str:
     """The report for people."""
     threads = report["threads"]
@@ -111,6 +129,7 @@ def summary(report: dict[str, Any]) -> str:
         f"packages   {packages}",
         f"threads    {threads['usable']} usable of {threads['processors']} processors",
         f"runtime    {', '.join(report['onnxruntime_builds'])}",
+        f"kernel     {_kernel_line(report['kernel'])}",
         *(f"provider   {name}: {state}" for name, state in report["providers"].items()),
         *(f"texture    {name}: largest difference from its manifest {error:.1g}" for name, error in report["textures"].items()),
         f"OpenGL     {report['opengl']}",

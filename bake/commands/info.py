@@ -53,6 +53,8 @@ def summary(texture: Texture, error: float) -> str:
         f"colour     {manifest['color_encoding']}",
         f"probe      {verdict} on {texture.provider}, largest difference {error:.1g}",
     ]
+    if texture.provider_note:
+        lines.append(f"note       {texture.provider_note}")
     if training:
         lines.append(f"trained    {training['iterations']} iterations, {training['minutes']:g} minutes, on {exemplars}")
     return "\n".join(lines)

@@ -1,6 +1,6 @@
 """The table of writers, from suffix to file format, and the little that all formats share."""
 
-from solidgrain.bake.writers.base import Output, Volume, Writer
+from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer
 from solidgrain.bake.writers.table import (
     encoding,
     make_output,
@@ -12,6 +12,7 @@ from solidgrain.bake.writers.table import (
 )
 
 __all__ = [
+    "FloatArray",
     "Output",
     "Volume",
     "Writer",

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.runtime.files import temporary_name
+from solidgrain.runtime.workers import Workers
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -51,10 +52,13 @@ class Output:
 
 
 class Writer(ABC):
-    """Takes the slabs of a volume in order. Nothing is visible under its final name before `commit`."""
+    """Takes the slabs of a volume in order. Nothing is visible under its final name before `commit`.
 
-    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
-        self.output, self.volume, self.threads = output, volume, threads
+    Slow work goes to `workers`, the threads that also evaluate the texture.
+    """
+
+    def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
+        self.output, self.volume, self.workers = output, volume, workers
 
     @abstractmethod
     def write(self, z: int, slab: FloatArray) -> None:
@@ -76,8 +80,8 @@ class Writer(ABC):
 class FileWriter(Writer):
     """A writer of a single file, under a temporary name in the same folder until it is whole."""
 
-    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
-        super().__init__(output, volume, threads)
+    def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
+        super().__init__(output, volume, workers)
         self.temporary = temporary_name(output.path)
         self.file: BinaryIO = open(self.temporary, "wb")  # noqa: SIM115
 

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from solidgrain.bake.frames import frame_paths
 from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer
 from solidgrain.runtime.errors import BakeError
 from solidgrain.runtime.files import sync, temporary_name
+from solidgrain.runtime.workers import Workers
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # xy of red, green, blue, white (ITU-R BT.709)
 
@@ -29,18 +30,17 @@ REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # xy of red, gree
 class ExrStack(Writer):
     """Slices gather in a hidden folder beside their destination until all of them are whole."""
 
-    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
+    def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
         import OpenEXR
 
-        super().__init__(output, volume, threads)
+        super().__init__(output, volume, workers)
         OpenEXR.set_global_thread_count(0)  # one slice per thread of ours beats its own pool
         self.paths = files(output, volume)
         self.staging = temporary_name(output.path)
         self.staging.mkdir()
 
     def write(self, z: int, slab: FloatArray) -> None:
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(self._write_slice, range(z, z + len(slab)), slab))
+        self.workers.run([partial(self._write_slice, z + k, level) for k, level in enumerate(slab)])
 
     def _write_slice(self, z: int, rgb: FloatArray) -> None:
         import OpenEXR

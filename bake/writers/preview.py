@@ -17,6 +17,7 @@ import numpy.typing as npt
 from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer, to_uint8
 from solidgrain.runtime.errors import BakeError
 from solidgrain.runtime.files import sync, temporary_name
+from solidgrain.runtime.workers import Workers
 
 PANEL = 384  # pixels along each side of a panel
 GAP = 12
@@ -38,8 +39,8 @@ class Plane:
 class PreviewFile(Writer):
     """Collects six planes, draws when the last slab has come."""
 
-    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
-        super().__init__(output, volume, threads)
+    def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
+        super().__init__(output, volume, workers)
         extents = volume.shape[::-1]
         self.steps = [-(-extent // FINEST) for extent in extents]
         middles = [Plane(axis, extents[axis] // 2) for axis in (2, 1, 0)]

@@ -8,13 +8,14 @@ from pathlib import Path
 
 from solidgrain.bake.writers.base import Output, Volume, Writer
 from solidgrain.runtime.errors import UsageError
+from solidgrain.runtime.workers import Workers
 
 
 @dataclass(frozen=True)
 class Format:
     """A file format: how to open it, its size at most, and the files that a path stands for."""
 
-    opener: Callable[[Output, Volume, int], Writer]
+    opener: Callable[[Output, Volume, Workers], Writer]
     size: Callable[[Output, Volume], int]
     files: Callable[[Output, Volume], list[Path]]
     encoding: str  # of its colours
@@ -47,8 +48,8 @@ def make_output(path: Path, **options: str | int) -> Output:
     return Output(path, path.suffix.lower(), options)
 
 
-def open_writer(output: Output, volume: Volume, threads: int) -> Writer:
-    return _formats()[output.kind].opener(output, volume, threads)
+def open_writer(output: Output, volume: Volume, workers: Workers) -> Writer:
+    return _formats()[output.kind].opener(output, volume, workers)
 
 
 def output_files(output: Output, volume: Volume) -> list[Path]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from solidgrain.bake.writers.base import FileWriter, FloatArray, Output, Volume, to_uint8
 from solidgrain.runtime.errors import BakeError
+from solidgrain.runtime.workers import Workers
 
 TYPES = {"uint8": ("UInt8", 1), "float32": ("Float32", 4)}
 
@@ -20,8 +21,8 @@ TYPES = {"uint8": ("UInt8", 1), "float32": ("Float32", 4)}
 class VtiFile(FileWriter):
     """The data's length is known beforehand, so header, slabs and trailer follow each other without seeking back."""
 
-    def __init__(self, output: Output, volume: Volume, threads: int) -> None:
-        super().__init__(output, volume, threads)
+    def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
+        super().__init__(output, volume, workers)
         self.dtype = _dtype(output)
         self.file.write(_header(volume, TYPES[self.dtype][0]).encode("ascii"))
         self.file.write(struct.pack("<Q", volume.voxels * 3 * TYPES[self.dtype][1]))

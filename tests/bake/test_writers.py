@@ -29,6 +29,7 @@ def plan_for(texture, *outputs: Output, tile: str = "") -> Plan:
         source="toy",
         texture="toy",
         sampler_sha256=texture.data.sampler_sha256,
+        precision="float32",
         seed=7,
         size=SIZE,
         origin=ORIGIN,

@@ -171,5 +171,5 @@ def test_a_provider_that_cannot_be_had_is_an_error_that_lists_the_others():
         load(provider="rocket")
 
 
-def test_the_provider_that_runs_is_named(toy):
-    assert toy.provider == "CPUExecutionProvider"
+def test_the_provider_that_runs_is_named(toy_folder):
+    assert load(toy_folder, provider="cpu").provider == "CPUExecutionProvider"
