@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
 
 Task = Callable[[], None]
 
@@ -16,13 +16,14 @@ class Workers:
         self.count = count
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
+        self._cancelled = 0  # how often
 
     def run(self, tasks: Sequence[Task]) -> None:
         """All tasks, in any order. The first error, or an interrupt, stops those that have not begun and is raised."""
         if len(tasks) == 1:
             tasks[0]()
             return
-        futures = [self._executor().submit(task) for task in tasks]
+        futures = [self._executor().submit(self._call, task, self._cancelled) for task in tasks]
         try:
             wait(futures, return_when=FIRST_EXCEPTION)
             for future in futures:
@@ -34,10 +35,13 @@ class Workers:
             wait(futures)
 
     def cancel(self) -> None:
-        """Whoever waits in `run`, in another thread, waits no longer than for the tasks that are running."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
-            self._pool = None
+        """Skip what has not begun: whoever waits in `run`, in whichever thread, gets a CancelledError."""
+        self._cancelled += 1
+
+    def _call(self, task: Task, cancelled: int) -> None:
+        if cancelled != self._cancelled:
+            raise CancelledError
+        task()
 
     def _executor(self) -> ThreadPoolExecutor:
         if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
