@@ -185,9 +185,9 @@ def test_an_interrupt_leaves_nothing_behind_and_exits_with_130(tmp_path, toy_fol
     outputs = ["--out", tmp_path / "a.####.exr", "--out", tmp_path / "a.vti", "--out", tmp_path / "a.npy"]
     process = subprocess.Popen([*map(str, command), *map(str, outputs)], stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not list(tmp_path.glob(".a.npy*")) and time.monotonic() < deadline:
+    while not list(tmp_path.glob(".a.*.npy")) and time.monotonic() < deadline:
         time.sleep(0.05)
-    time.sleep(1)
+    time.sleep(0.5)
     process.send_signal(number)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
