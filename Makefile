@@ -6,12 +6,12 @@ BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 WHEEL_VENV := build/wheel-venv
 
-.PHONY: install check test test-slow wheel test-wheel bench pictures clean
+.PHONY: install check test test-slow wheel test-wheel sanitize bench pictures clean
 
 install: $(VENV)/installed
 
 # torch first and by exact version: a bare "torch" may bring gigabytes of CUDA libraries along.
-$(VENV)/installed: pyproject.toml
+$(VENV)/installed: pyproject.toml $(wildcard runtime/native/*)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet $(TORCH)
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
@@ -43,8 +43,18 @@ test-wheel: wheel
 	! $(WHEEL_VENV)/bin/python -c 'import torch' 2>/dev/null
 	$(WHEEL_VENV)/bin/python -m pytest tests/runtime tests/bake
 
+# The fused kernel under the address and undefined-behaviour sanitizers: its tests, every path that this machine has.
+SANITIZED := build/sanitized/_kernel.so
+sanitize: install
+	mkdir -p $(dir $(SANITIZED))
+	$(CXX) -std=c++17 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer \
+		-ffp-contract=off -fPIC -shared -Wno-psabi runtime/native/*.cpp -o $(SANITIZED)
+	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
+		SOLIDGRAIN_KERNEL_LIBRARY=$(SANITIZED) \
+		$(BIN)/python -m pytest tests/runtime/test_kernel.py -k 'not damaged_library and not interrupt and not come_and_go'
+
 bench: install
-	$(BIN)/python tests/bench/bench.py
+	$(BIN)/python -m tests.bench.bench
 
 pictures: install
 	$(BIN)/python docs/pictures.py

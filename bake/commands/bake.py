@@ -175,8 +175,17 @@ def result(plan: Plan, baked: Baked) -> dict[str, Any]:
         "seconds": round(baked.seconds, 3),
         "evaluation_seconds": round(baked.evaluation_seconds, 3),
         "voxels_per_second": round(plan.volume.voxels / baked.seconds),
-        "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        "peak_memory_bytes": peak_memory(),
     }
+
+
+def peak_memory() -> int:
+    """The most bytes that were resident. Linux's ru_maxrss starts at what the parent process had: /proc does not."""
+    try:
+        status = Path("/proc/self/status").read_text("ascii")
+        return int(status.split("VmHWM:")[1].split()[0]) * 1024
+    except (OSError, IndexError):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 class Progress:

@@ -1,111 +1,135 @@
-"""The figures of the README: start-up, memory and speed, each measured in a process of its own where that matters.
+"""The figures of README and docs/speed.md: `make bench` prints them as Markdown and writes them to build/bench.json.
 
-make bench        prints a Markdown table; `--size 128` for a shorter run
+Rates are the best of several runs; everything that is compared is measured in the same run of the bench. Nothing else should be
+running. `--quick` leaves out the largest sizes.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
-import tempfile
-import time
-from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from solidgrain.runtime import load
-from solidgrain.runtime.noise import noise_tables
+from solidgrain.runtime.kernel import BFLOAT16_PATHS, kernel_paths
 from solidgrain.runtime.provider import usable_threads
+from tests.bench import measure
 
-CLI = [sys.executable, "-m", "solidgrain.bake.cli"]
-MEGABYTE = 2**20
+MEGA = 1e6
+REPORT = Path("build/bench.json")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", type=int, default=256, help="voxels along each axis of the bake")
-    size = parser.parse_args().size
-    print(f"{usable_threads()} threads\n\n| what | figure | goal |\n|---|---|---|", flush=True)
-    row("import solidgrain.runtime", f"{import_seconds():.2f} s", "0.35 s")
-    row("solidgrain --help", f"{best(lambda: run([*CLI, '--help'])):.2f} s", "0.2 s")
-    baked = bake(f"{size}", size)
-    row(f"bake {size}³ to EXR + VTI: peak memory", f"{baked['peak_memory_bytes'] / MEGABYTE:.0f} MB", "700 MB")
-    shallow, deep = (bake(f"256x256x{depth}", size)["peak_memory_bytes"] for depth in (64, 1024 if size >= 256 else 128))
-    row("peak memory, 256x256x1024 over 256x256x64", f"{deep / shallow:.2f}", "1.10")
-    row("sampler only, in the bake", f"{size**3 / baked['evaluation_seconds'] / 1e6:.2f} Mvoxel/s", "")
-    row("bake end to end", f"{baked['voxels_per_second'] / 1e6:.2f} Mvoxel/s", "")
-    row("the same graph, one ONNX Runtime session with all threads", f"{graph_rate():.2f} Mvoxel/s", "")
-    row("torch, eager, float32", f"{torch_rate():.2f} Mvoxel/s", "")
-
-
-def row(what: str, figure: str, goal: str) -> None:
-    print(f"| {what} | {figure} | {goal} |", flush=True)
-
-
-def run(command: list[str]) -> str:
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-
-def best(action: Callable[[], object], times: int = 5) -> float:
-    """Seconds of the fastest of several calls."""
-    found = []
-    for _ in range(times):
-        started = time.perf_counter()
-        action()
-        found.append(time.perf_counter() - started)
-    return min(found)
-
-
-def import_seconds() -> float:
-    code = "import time; t = time.perf_counter(); import solidgrain.runtime; print(time.perf_counter() - t)"
-    return min(float(run([sys.executable, "-c", code])) for _ in range(5))
-
-
-def bake(size: str, cube: int) -> dict[str, float]:
-    with tempfile.TemporaryDirectory() as folder:
-        outputs = ["--out", f"{folder}/a.####.exr", "--out", f"{folder}/a.vti"]
-        report: dict[str, float] = json.loads(run([*CLI, "bake", "granite", "--size", size, "--json", "--quiet", *outputs]))
-        return report
-
-
-def graph_rate(points: int = 2**17) -> float:
-    """The exported graph as any other program would run it: one session, one call, ONNX Runtime's own threads."""
-    import onnxruntime
-
-    texture = load("granite")
-    session = onnxruntime.InferenceSession(str(texture.bundle.folder / "sampler.onnx"), providers=["CPUExecutionProvider"])
-    octaves = len(texture.transforms)
-    feed = {
-        **texture.data.arrays(),
-        "points": slice_points(points),
-        "offsets": np.zeros((octaves, 3)),
-        "lattice": np.tile(64 * np.eye(3), (octaves, 1, 1)),
-        "noise": noise_tables(0, octaves),
+    parser.add_argument("--quick", action="store_true", help="leave out the largest sizes")
+    quick = parser.parse_args().quick
+    threads = sorted({1, usable_threads()})
+    report: dict[str, Any] = {"threads": threads[-1], "kernel_paths": kernel_paths()}
+    report["gemm"] = {
+        f"{precision}, {count}": measure.gemm_rate(precision, count)
+        for precision in ("float32", "bfloat16")
+        for count in threads
     }
-    return points / best(lambda: session.run(["rgb"], feed), 3) / 1e6
+    report["rates"] = [row for octaves in (32, 16) for row in rates(octaves, threads, report["gemm"])]
+    report["start"] = start()
+    report["bakes"] = bakes(256 if not quick else 128)
+    report["scaling"] = scaling((64, 128, 256) if quick else (64, 128, 256, 512))
+    REPORT.parent.mkdir(exist_ok=True)
+    REPORT.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    print(f"\n{REPORT} holds all of it.")
 
 
-def torch_rate(points: int = 2**17) -> float:
-    """The sampler as it was trained, with weights of no importance."""
-    import torch
+def rates(octaves: int, threads: list[int], gemm: dict[str, float]) -> list[dict[str, Any]]:
+    """The table of evaluators, one row per way and thread count."""
+    heading(f"n = {octaves}, Mvoxel/s", "way", "threads", "grid", "tiled", "points", "× torch", "× ONNX graph", "of GEMM")
+    rows = []
+    with measure.bundle(octaves) as folder:
+        for count in threads:
+            torch_rate, graph = measure.torch_rate(octaves, count), measure.graph_rate(folder, count)
+            found = {"torch, eager": {"points": torch_rate}, "ONNX graph, one session": {"points": graph}}
+            found["runtime: ONNX Runtime"] = measure.texture_rates(folder, count, "cpu")
+            for path in kernel_paths():
+                found[f"runtime: kernel {path}"] = measure.texture_rates(folder, count, path)
+                if path in BFLOAT16_PATHS:
+                    found[f"runtime: kernel {path}, bfloat16"] = measure.texture_rates(folder, count, path, "bfloat16")
+            found["torch, eager, AVX2 only"] = {"points": measure.torch_rate_without_avx512(octaves, count)}
+            for precision in ("float32", "bfloat16"):
+                found[f"perceptron alone, torch {precision}"] = {"points": measure.library_rate(octaves, precision, count)}
+            for way, rate in found.items():
+                fast = rate.get("grid", rate["points"])
+                peak = gemm[f"{'bfloat16' if 'bfloat16' in way else 'float32'}, {count}"]
+                row = {
+                    "octaves": octaves,
+                    "way": way,
+                    "threads": count,
+                    **{key: round(value / MEGA, 3) for key, value in rate.items()},
+                    "over_torch": round(fast / torch_rate, 1),
+                    "over_graph": round(fast / graph, 1),
+                    "of_gemm": round(fast * measure.flops(octaves) / peak, 2),
+                }
+                rows.append(row)
+                keys = ("way", "threads", "grid", "tiled", "points", "over_torch", "over_graph", "of_gemm")
+                line(*(row.get(key, "") for key in keys))
+    return rows
 
-    from solidgrain.train.sampler import Sampler
-    from solidgrain.train.settings import FAST
 
-    torch.set_num_threads(usable_threads())
-    sampler = Sampler(FAST, torch.Generator().manual_seed(0))
-    tables = torch.from_numpy(noise_tables(0, 16))
-    where = torch.from_numpy(slice_points(points) / 64).float()[None]
-    with torch.no_grad():
-        return points / best(lambda: sampler(tables, where), 3) / 1e6
+def start() -> dict[str, float]:
+    heading("Start-up", "what", "seconds")
+    found = {
+        "import solidgrain.runtime": measure.import_seconds(),
+        "solidgrain --help": measure.best(lambda: measure.run([*measure.CLI, "--help"]), 5),
+        "process start to the first slab, 16 × 128²": measure.first_slab_seconds(),
+    }
+    for what, seconds in found.items():
+        line(what, f"{seconds:.2f}")
+    return found
 
 
-def slice_points(count: int) -> np.ndarray:
-    """Voxel centres of a plane 256 wide, rows first."""
-    y, x = np.divmod(np.arange(count), 256)
-    return np.stack([x + 0.5, y + 0.5, np.full(count, 0.5)], axis=1)
+def bakes(size: int) -> list[dict[str, Any]]:
+    """End to end: whole bakes against the evaluation alone."""
+    heading(f"{size}³ of the embedded texture, end to end", "outputs", "seconds", "× evaluation alone", "Mvoxel/s", "peak MB")
+    rows = []
+    cases: list[tuple[str, tuple[str, ...], str]] = [
+        ("EXR half", (".####.exr",), "float32"),
+        ("VTI uint8", (".vti",), "float32"),
+        ("EXR + VTI", (".####.exr", ".vti"), "float32"),
+    ]
+    if kernel_paths()[0] in BFLOAT16_PATHS:
+        cases.append(("EXR half, bfloat16", (".####.exr",), "bfloat16"))
+    for what, suffixes, precision in cases:
+        alone = measure.evaluation_seconds(size, precision)
+        baked = measure.bake(str(size), *suffixes, options=("--precision", precision))
+        row = {
+            "outputs": what,
+            "seconds": round(baked["seconds"], 2),
+            "over_evaluation": round(baked["seconds"] / alone, 2),
+            "rate": round(size**3 / baked["seconds"] / MEGA, 2),
+            "peak_megabytes": round(baked["peak_memory_bytes"] / 2**20),
+        }
+        rows.append(row)
+        line(*row.values())
+    shallow, deep = (measure.bake(f"256x256x{depth}", ".vti")["peak_memory_bytes"] for depth in (64, 4 * size))
+    line(f"peak memory, 256×256×{4 * size} over 256×256×64", f"{deep / shallow:.2f}", "", "", "")
+    rows.append({"outputs": "peak memory, deep over shallow", "ratio": deep / shallow})
+    return rows
+
+
+def scaling(sizes: tuple[int, ...]) -> dict[int, float]:
+    heading("Time per voxel against size, evaluation alone", "cube", "ns per voxel")
+    found = {size: measure.evaluation_seconds(size) / size**3 * 1e9 for size in sizes}
+    for size, nanoseconds in found.items():
+        line(f"{size}³", f"{nanoseconds:.0f}")
+    return found
+
+
+def heading(title: str, *columns: str) -> None:
+    print(f"\n{title}\n")
+    line(*columns)
+    line(*["---"] * len(columns))
+
+
+def line(*cells: object) -> None:
+    print(f"| {' | '.join(str(cell) for cell in cells)} |", flush=True)
 
 
 if __name__ == "__main__":
