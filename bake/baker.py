@@ -32,10 +32,11 @@ def bake(plan: Plan, texture: Texture, on_slice: OnSlice = lambda done, total: N
     nothing is left behind.
     """
     writers: list[Writer] = []
+    workers = texture.workers.share()
     started = time.monotonic()
     try:
         for output in plan.outputs:
-            writers.append(open_writer(output, plan.volume, texture.workers))
+            writers.append(open_writer(output, plan.volume, workers))
         evaluation = _feed(plan, texture, writers, on_slice)
         for writer in writers:
             writer.finish()
@@ -79,6 +80,7 @@ def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], on_slice: OnS
             if writing is not None:
                 writing.result()
         except BaseException:
-            texture.workers.cancel()  # what the writers are waiting for
+            for writer in writers:
+                writer.workers.cancel()  # or leaving would wait for all that they have begun
             raise
     return evaluation

@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 import os
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ PATHS = ("amx", "avx512", "avx2", "portable")
 BFLOAT16_PATHS = ("amx",)
 BRICKS_PER_TASK = 4  # 16 384 voxels: some milliseconds, a fifth of a second on the slowest path
 POINTS_PER_TASK = 16384
+STEEPEST = 2.0**13  # texels per pixel: times the farthest point, below 2^53
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
@@ -71,7 +72,8 @@ def choose_path(precision: str) -> str:
     path = wanted or offered[0]
     if precision == "bfloat16" and path not in BFLOAT16_PATHS:
         raise KernelMissingError(
-            f"precision 'bfloat16': needs a processor with AMX, here the fused kernel runs on {path}; use float32"
+            f"precision 'bfloat16': needs AMX, which this processor lacks or the system keeps from this process "
+            f"(the fused kernel runs on {path}); use float32"
         )
     return path
 
@@ -86,7 +88,10 @@ class KernelEngine:
             raise KernelMissingError(
                 f"the sampler is {texture.gamma.shape[1]} units wide, the fused kernel takes multiples of 16"
             )
+        if np.abs(texture.transforms).sum(2).max() > STEEPEST:
+            raise KernelMissingError(f"an octave has more than {STEEPEST:g} texels per pixel")
         self.texture, self.folded = texture, fold(list(weights), texture)
+        self.library = _library(_library_file())
         self.name = f"kernel:{self.path}"
 
     def instance(self, tiling: Tiling, seed: int) -> KernelInstance:
@@ -110,7 +115,7 @@ class KernelInstance:
         description = _Description(octaves, width, layers, engine.precision == "bfloat16", any(tiling.period))
         for name, array in arrays.items():
             setattr(description, name, array.ctypes.data)
-        self.library, self.name = _library(_library_file()), texture.name
+        self.library, self.name = engine.library, texture.name
         self.handle: int | None = self.library.solidgrain_open(ctypes.byref(description), engine.path.encode())
         if not self.handle:
             raise EvaluationError(f"{self.name}: not enough memory for the fused kernel")
@@ -133,18 +138,20 @@ class KernelInstance:
     def _points(self, points: DoubleArray, rgb: FloatArray) -> None:
         found = self.library.solidgrain_points(self.handle, points.ctypes.data, len(points), rgb.ctypes.data)
         if found != -1:
-            self._fail(found, lambda: points[found])
+            self._fail(found, points[found] if found >= 0 else points[0])
 
     def _bricks(self, x: DoubleArray, y: DoubleArray, z: DoubleArray, first: int, count: int, rgb: FloatArray) -> None:
         axes = [item for axis in (x, y, z) for item in (axis.ctypes.data, len(axis))]
         found = self.library.solidgrain_grid(self.handle, *axes, first, count, rgb.ctypes.data)
         if found != -1:
-            self._fail(found, lambda: (x[found % len(x)], y[found // len(x) % len(y)], z[found // len(x) // len(y)]))
+            rows, column = divmod(found, len(x))
+            plane, row = divmod(rows, len(y))
+            self._fail(found, (x[column], y[row], z[plane % len(z)]))
 
-    def _fail(self, found: int, place: Callable[[], Any]) -> None:
+    def _fail(self, found: int, place: Sequence[float]) -> None:
         if found < 0:
             raise EvaluationError(f"{self.name}: not enough memory for the fused kernel")
-        x, y, z = place()
+        x, y, z = place
         raise EvaluationError(f"{self.name}: the sampler returned NaN at ({x:g}, {y:g}, {z:g}); the texture is damaged")
 
 
@@ -161,15 +168,21 @@ def _library_file() -> Path:
 
 @cache
 def _library(path: Path) -> ctypes.CDLL:
-    """The loaded library. Raises KernelMissingError if the file is missing, damaged or of another version."""
+    """The loaded library. Raises KernelMissingError if the file is missing, cut short, foreign or of another version."""
     try:
         _check_whole(path)
         library = ctypes.CDLL(os.fspath(path))
         abi = library.solidgrain_abi()
+        if abi != ABI:
+            raise ValueError(f"{path} is made for interface {abi}, expected {ABI}")
+        _declare(library)
     except (OSError, AttributeError, ValueError) as error:
         raise KernelMissingError(f"the fused kernel cannot be loaded ({error}); install solidgrain again") from error
-    if abi != ABI:
-        raise KernelMissingError(f"{path}: made for interface {abi}, expected {ABI}; install solidgrain again")
+    return library
+
+
+def _declare(library: ctypes.CDLL) -> None:
+    """Results and arguments of every function. Raises AttributeError if one is missing."""
     integer, pointer = ctypes.c_int64, ctypes.c_void_p
     for name, result, arguments in (
         ("solidgrain_paths", ctypes.c_char_p, ()),
@@ -181,7 +194,6 @@ def _library(path: Path) -> ctypes.CDLL:
     ):
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
-    return library
 
 
 def _check_whole(path: Path) -> None:
@@ -193,6 +205,8 @@ def _check_whole(path: Path) -> None:
         header = file.read(64)
     if header[:5] != b"\x7fELF\x02":
         return  # another kind of library: its loader will tell
+    if len(header) < 64:
+        raise ValueError(f"{path} is cut short")
     (start,), (size, count) = struct.unpack_from("<Q", header, 40), struct.unpack_from("<HH", header, 58)
     if path.stat().st_size < start + size * count:
         raise ValueError(f"{path} is cut short")

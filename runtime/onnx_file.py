@@ -18,6 +18,8 @@ import numpy.typing as npt
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5  # wire types
 DTYPES = {1: "<f4", 6: "<i4", 7: "<i8", 9: "?", 11: "<f8"}  # TensorProto.DataType
 
+DAMAGED = (IndexError, TypeError, AttributeError, OverflowError, MemoryError, RecursionError, UnicodeDecodeError, struct.error)
+
 Array = npt.NDArray[Any]
 Attribute = Any  # float, int, bytes, a tuple of int, Array or Graph
 
@@ -49,7 +51,7 @@ def parse_model(data: bytes) -> Graph:
         if 25 in model:
             raise ValueError("model has functions of its own")
         return _graph(model[7][0])
-    except (IndexError, struct.error, UnicodeDecodeError) as error:
+    except DAMAGED as error:
         raise ValueError(f"not an ONNX model, or damaged ({error})") from error
 
 

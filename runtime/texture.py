@@ -33,7 +33,8 @@ Vector = tuple[float, float, float]
 
 DEFAULT_TEXTURE = "granite"
 SLAB = 16  # slices per slab
-FARTHEST = 2.0**40  # exemplar pixels: a float64 still tells 4096 places within a pixel there
+FARTHEST = 2.0**36  # exemplar pixels: float64 coordinates still tell the places within a texel apart there
+LARGEST = 2**40  # voxels along an axis, threads, slices: what no machine has
 
 
 def load(
@@ -85,6 +86,15 @@ def _matching(data: TextureData, owner: Bundle) -> tuple[TextureData, Bundle]:
             f"{owner.folder}: its sampler.onnx has sha256 {owner.sampler_sha256[:12]}…, "
             f"texture {data.name!r} needs {data.sampler_sha256[:12]}…; use the bundle that the texture was made with"
         )
+    octaves, width, layers = (owner.manifest[key] for key in ("octaves", "width", "hidden_layers"))
+    expected = {"transforms": (octaves, 3, 3), "gamma": (layers, width), "delta": (layers, width)}
+    expected["noise_weights"] = (4, octaves // 4, width)
+    for name, shape in expected.items():
+        if data.arrays()[name].shape != shape:
+            raise BundleError(
+                f"{owner.folder}: {name} of texture {data.name!r} has shape {data.arrays()[name].shape}, expected {shape}; "
+                "the texture is damaged, save it again"
+            )
     return data, owner
 
 
@@ -121,7 +131,7 @@ class Texture:
     def sample(self, points: npt.ArrayLike, seed: int = 0) -> FloatArray:
         """Colour at points [P, 3] (x, y, z) in exemplar pixels -> [P, 3] float32 in [0, 1], sRGB-encoded.
 
-        A point that is NaN, infinite or beyond 2^40 pixels has the colour NaN, and a RuntimeWarning counts them. Raises
+        A point that is NaN, infinite or beyond 2^36 pixels has the colour NaN, and a RuntimeWarning counts them. Raises
         EvaluationError for points of another shape.
         """
         try:
@@ -227,9 +237,10 @@ class Texture:
         except TypeError as error:
             raise EvaluationError(f"seed {seed!r}: expected a whole number from 0 to 2^64 - 1") from error
         key = (number, tiling.transforms.tobytes(), tiling.lattice.tobytes())
-        if self._last is None or self._last[0] != key:
-            self._last = (key, self._engine.instance(tiling, number))
-        return self._last[1]
+        last = self._last  # another thread may replace it at any time
+        if last is None or last[0] != key:
+            last = self._last = (key, self._engine.instance(tiling, number))
+        return last[1]
 
 
 def _positive(name: str, values: Sequence[int]) -> tuple[int, ...]:
@@ -241,8 +252,9 @@ def _whole(name: str, values: Sequence[int], count: int, least: int) -> tuple[in
         numbers = tuple(operator.index(value) for value in values)
     except TypeError:
         numbers = ()
-    if len(numbers) != count or min(numbers) < least:
-        raise EvaluationError(f"{name} {values}: expected {count} whole number{'s' * (count > 1)} of at least {least}")
+    if len(numbers) != count or min(numbers) < least or max(numbers) > LARGEST:
+        plural = "s" * (count > 1)
+        raise EvaluationError(f"{name} {values}: expected {count} whole number{plural} from {least} to {LARGEST}")
     return numbers
 
 

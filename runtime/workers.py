@@ -14,36 +14,49 @@ class Workers:
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self._pool: ThreadPoolExecutor | None = None
-        self._process = 0
-        self._cancelled = 0  # how often
+        self._pool = _Pool(count)
+        self._cancelled = False
+
+    def share(self) -> Workers:
+        """The same threads, to be cancelled on their own."""
+        others = Workers(self.count)
+        others._pool = self._pool
+        return others
 
     def run(self, tasks: Sequence[Task]) -> None:
         """All tasks, in any order. The first error, or an interrupt, stops those that have not begun and is raised."""
-        if len(tasks) == 1:
-            tasks[0]()
-            return
-        futures = [self._executor().submit(self._call, task, self._cancelled) for task in tasks]
+        executor, futures = self._pool.executor(), []
         try:
+            for task in tasks:
+                futures.append(executor.submit(self._call, task))
             wait(futures, return_when=FIRST_EXCEPTION)
             for future in futures:
                 if future.done():
                     future.result()
         finally:
-            for future in futures:
-                future.cancel()
-            wait(futures)
+            wait([future for future in futures if not future.cancel()])
 
     def cancel(self) -> None:
-        """Skip what has not begun: whoever waits in `run`, in whichever thread, gets a CancelledError."""
-        self._cancelled += 1
+        """Skip what has not begun, for good: whoever waits in `run`, or calls it later, gets a CancelledError."""
+        self._cancelled = True
 
-    def _call(self, task: Task, cancelled: int) -> None:
-        if cancelled != self._cancelled:
+    def _call(self, task: Task) -> None:
+        if self._cancelled:
             raise CancelledError
         task()
 
-    def _executor(self) -> ThreadPoolExecutor:
-        if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
-            self._pool, self._process = ThreadPoolExecutor(self.count, thread_name_prefix="solidgrain"), os.getpid()
-        return self._pool
+
+class _Pool:
+    """An executor that survives a fork: threads do not. It starts its threads when they are needed."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._make()
+
+    def executor(self) -> ThreadPoolExecutor:
+        if self._process != os.getpid():
+            self._make()
+        return self._executor
+
+    def _make(self) -> None:
+        self._executor, self._process = ThreadPoolExecutor(self.count, thread_name_prefix="solidgrain"), os.getpid()

@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         finally:
             progress.end_line()
         progress.finish(plan, baked)
-        report = result(plan, baked)
+        report = result(plan, texture, baked)
     if arguments.json:
         print(json.dumps(report, indent=2))
     return 0
@@ -164,7 +164,7 @@ def summary(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def result(plan: Plan, baked: Baked) -> dict[str, Any]:
+def result(plan: Plan, texture: Texture, baked: Baked) -> dict[str, Any]:
     """What `--json` prints after a bake."""
     from solidgrain.bake.writers import encoding
 
@@ -172,6 +172,7 @@ def result(plan: Plan, baked: Baked) -> dict[str, Any]:
         "plan": plan.to_json(),
         "files": [str(path) for path in baked.files],
         "color_encoding": {str(output.path): encoding(output) for output in plan.outputs},
+        "provider": texture.provider,
         "seconds": round(baked.seconds, 3),
         "evaluation_seconds": round(baked.evaluation_seconds, 3),
         "voxels_per_second": round(plan.volume.voxels / baked.seconds),

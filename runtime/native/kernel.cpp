@@ -70,18 +70,12 @@ void* allocate(size_t bytes) {
   return block;
 }
 
-uint32_t round_to_bfloat(float value) {
-  uint32_t bits;
-  memcpy(&bits, &value, 4);
-  return (bits + 0x7fff + (bits >> 16 & 1)) >> 16;
-}
-
 // The table [64, 64, 64] as [64, 64, 65] floats, or bfloat16 pairs.
 void fill_table(const float* noise, bool bfloat16, void* table) {
   for (int row = 0; row < RESOLUTION * RESOLUTION; row++, noise += RESOLUTION)
     for (int z = 0; z < ROW; z++) {
       float texel = noise[z % RESOLUTION], next = noise[(z + 1) % RESOLUTION];
-      uint32_t pair = round_to_bfloat(texel) | round_to_bfloat(next) << 16;
+      uint32_t pair = round_to_bfloat16(texel) | round_to_bfloat16(next) << 16;
       memcpy(static_cast<uint32_t*>(table) + row * ROW + z, bfloat16 ? static_cast<void*>(&pair) : &texel, 4);
     }
 }

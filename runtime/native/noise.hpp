@@ -25,17 +25,18 @@ inline void table_corners(const typename S::D (&at)[3], typename S::I (&low)[4],
   typename S::I cell[3];
   for (int axis = 0; axis < 3; axis++) {
     auto turns = S::floor(S::mul(at[axis], S::all(1.0 / RESOLUTION)));
-    auto inside = S::fma(turns, S::all(-double(RESOLUTION)), at[axis]);  // exact: 64 is a power of two
+    auto inside = S::fma(turns, S::all(-double(RESOLUTION)), at[axis]);
     if (coarse) {  // to 2^-18 of a texel, for bfloat16
       auto rounded = S::to_float(inside);
       auto whole = S::floor(rounded);
-      cell[axis] = S::bit_and(S::to_int(whole), S::all(RESOLUTION - 1));  // it may have been rounded up to 64
+      cell[axis] = S::to_int(whole);
       fraction[axis] = S::sub(rounded, whole);
     } else {
       auto whole = S::floor(inside);
       cell[axis] = S::to_int(whole);
       fraction[axis] = S::to_float(S::sub(inside, whole));
     }
+    cell[axis] = S::bit_and(cell[axis], S::all(RESOLUTION - 1));  // just below 0, `inside` is rounded up to 64
   }
   const auto one = S::all(1), mask = S::all(RESOLUTION - 1), plane = S::all(RESOLUTION * ROW), row = S::all(ROW);
   auto x0 = S::mul(cell[0], plane), x1 = S::mul(S::bit_and(S::add(cell[0], one), mask), plane);
@@ -212,7 +213,8 @@ template <class S> bool is_far(const Octave& octave, const double (&farthest)[3]
   return 4 * cells * (entries + 1) >= 0x1p50;
 }
 
-template <class S> void look_up(const Sampler& sampler, const double* x, const double* y, const double* z, int count, float* eta) {
+// With `pairs`, the sampler's precision may be bfloat16.
+template <class S, bool pairs> void look_up(const Sampler& sampler, const double* x, const double* y, const double* z, int count, float* eta) {
   double farthest[3] = {0, 0, 0};
   const double* along[3] = {x, y, z};
   for (int axis = 0; axis < 3 && sampler.tiled; axis++)
@@ -220,8 +222,9 @@ template <class S> void look_up(const Sampler& sampler, const double* x, const d
   for (int i = 0; i < sampler.octaves; i++, eta += STRIDE) {
     const Octave& octave = sampler.octave[i];
     bool far = sampler.tiled && is_far<S>(octave, farthest);
-    auto run = sampler.bfloat16 ? (sampler.tiled ? look_up_octave<S, PairTable<S>, true> : look_up_octave<S, PairTable<S>, false>)
-                                : (sampler.tiled ? look_up_octave<S, FloatTable<S>, true> : look_up_octave<S, FloatTable<S>, false>);
+    auto run = sampler.tiled ? look_up_octave<S, FloatTable<S>, true> : look_up_octave<S, FloatTable<S>, false>;
+    if constexpr (pairs)
+      if (sampler.bfloat16) run = sampler.tiled ? look_up_octave<S, PairTable<S>, true> : look_up_octave<S, PairTable<S>, false>;
     run(octave, far, x, y, z, count, eta);
   }
 }

@@ -15,7 +15,7 @@ SOLIDGRAIN_TARGET("amx-tile,amx-bf16,avx512bf16,avx512f,avx512dq,avx512bw,avx512
 #include "perceptron_amx.hpp"
 
 const Path amx_path = {
-    "amx", true, amx_packed_bytes, amx_pack, amx_scratch_bytes, look_up<Avx512>, amx_perceive,
+    "amx", true, amx_packed_bytes, amx_pack, amx_scratch_bytes, look_up<Avx512, true>, amx_perceive,
 };
 
 SOLIDGRAIN_TARGET_END

@@ -15,7 +15,7 @@ SOLIDGRAIN_TARGET("avx2,fma")
 #include "perceptron.hpp"
 
 const Path avx2_path = {
-    "avx2", false, packed_bytes<Avx2>, pack<Avx2>, scratch_bytes<Avx2>, look_up<Avx2>, perceive<Avx2>,
+    "avx2", false, packed_bytes<Avx2>, pack<Avx2>, scratch_bytes<Avx2>, look_up<Avx2, false>, perceive<Avx2>,
 };
 
 SOLIDGRAIN_TARGET_END

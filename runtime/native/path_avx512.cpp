@@ -15,7 +15,7 @@ SOLIDGRAIN_TARGET("avx512f,avx512dq,avx512bw,avx512vl,avx2,fma")
 #include "perceptron.hpp"
 
 const Path avx512_path = {
-    "avx512", false, packed_bytes<Avx512>, pack<Avx512>, scratch_bytes<Avx512>, look_up<Avx512>, perceive<Avx512>,
+    "avx512", false, packed_bytes<Avx512>, pack<Avx512>, scratch_bytes<Avx512>, look_up<Avx512, false>, perceive<Avx512>,
 };
 
 SOLIDGRAIN_TARGET_END

@@ -5,5 +5,5 @@
 #include "perceptron.hpp"
 
 const Path portable_path = {
-    "portable", false, packed_bytes<Portable>, pack<Portable>, scratch_bytes<Portable>, look_up<Portable>, perceive<Portable>,
+    "portable", false, packed_bytes<Portable>, pack<Portable>, scratch_bytes<Portable>, look_up<Portable, false>, perceive<Portable>,
 };

@@ -74,9 +74,8 @@ template <class S> void perceive(const Sampler& sampler, const float* eta, int c
     float* out = units + size_t(BLOCK) * (sampler.width + S::TILE_OUTPUTS);
     for (int l = 0; l <= sampler.hidden_layers; l++) {
       const Layer& layer = sampler.layer[l];
-      const float* own = eta + size_t(l * bin) * STRIDE;  // of no consequence where the layer has no bin
-      if (l < sampler.hidden_layers) evaluate_layer<S, true>(layer, units, layer.octaves ? own : eta, out);
-      else evaluate_layer<S, false>(layer, units, eta, out);
+      const float* own = eta + size_t(layer.octaves ? l * bin : 0) * STRIDE;
+      (l < sampler.hidden_layers ? evaluate_layer<S, true> : evaluate_layer<S, false>)(layer, units, own, out);
       float* former = units;
       units = out, out = former;
     }

@@ -34,12 +34,6 @@ inline int parts(const Sampler& sampler) { return sampler.bfloat16 ? 1 : 2; }
 inline int bin_inputs(const Sampler& sampler, const Layer& layer) { return layer.octaves * (sampler.bfloat16 ? 1 : 3); }
 inline int bin_tiles(const Sampler& sampler, const Layer& layer) { return tiles(bin_inputs(sampler, layer)); }
 
-inline bfloat to_bfloat(float value) {  // to the nearest, ties to even
-  uint32_t bits;
-  memcpy(&bits, &value, 4);
-  return bfloat((bits + 0x7fff + ((bits >> 16) & 1)) >> 16);
-}
-
 inline float to_float(bfloat value) {
   uint32_t bits = uint32_t(value) << 16;
   float result;
@@ -61,8 +55,8 @@ size_t amx_packed_bytes(const Sampler& sampler, const Layer& layer) {
 }
 
 bfloat part_of(float value, bool low) {
-  const bfloat high = to_bfloat(value);
-  return low ? to_bfloat(value - to_float(high)) : high;
+  const bfloat high = bfloat(round_to_bfloat16(value));
+  return low ? bfloat(round_to_bfloat16(value - to_float(high))) : high;
 }
 
 // The number in a column of a row of weight tiles.
@@ -287,6 +281,7 @@ template <bool split> void amx_blocks(const Sampler& sampler, const float* eta, 
 void amx_perceive(const Sampler& sampler, const float* eta, int count, float* rgb, void* scratch) {
   TileShapes shapes;
   for (int i = 0; i < 8; i++) shapes.row_bytes[i] = ROW_BYTES, shapes.rows[i] = 16;
+  __asm__ volatile("" ::"r"(&shapes) : "memory");  // GCC 12 believes that eight bytes of it are read
   _tile_loadconfig(&shapes);
   memset(scratch, 0, amx_scratch_bytes(sampler));  // what fills up the last tiles must be zero
   (sampler.bfloat16 ? amx_blocks<false> : amx_blocks<true>)(sampler, eta, count, rgb, scratch);

@@ -3,6 +3,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 
 constexpr int RESOLUTION = 64;               // texels along each axis of a noise table
 constexpr int ROW = RESOLUTION + 1;          // stored texels along z: the first again, so that neighbours are always adjacent
@@ -13,6 +14,13 @@ constexpr int SWEEP = 4096;                  // points per sweep over the octave
 constexpr int PADDING = 192;                 // points are filled up to a multiple of every path's block
 constexpr int STRIDE = 4224;                 // floats from one octave's eta to the next: a whole sweep, filled up
 constexpr size_t ALIGNMENT = 64;
+
+// The upper half of a float, to the nearest, ties to even.
+static inline uint32_t round_to_bfloat16(float value) {
+  uint32_t bits;
+  memcpy(&bits, &value, 4);
+  return (bits + 0x7fff + (bits >> 16 & 1)) >> 16;
+}
 
 // One octave of noise: c = T p + o, looked up modulo 64 or modulo a lattice.
 struct Octave {

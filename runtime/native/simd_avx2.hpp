@@ -5,6 +5,8 @@
 
 #include <cstdint>
 
+namespace {  // one per source file, each compiled for its own instruction sets
+
 struct Avx2 {
   static constexpr int LANES = 8;
   static constexpr int TILE_OUTPUTS = 4, TILE_VECTORS = 3;  // accumulators of the perceptron: 12 of 16 registers
@@ -64,3 +66,5 @@ struct Avx2 {
     high = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(odds), 0xd8));
   }
 };
+
+}  // namespace

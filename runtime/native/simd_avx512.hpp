@@ -5,6 +5,8 @@
 
 #include <cstdint>
 
+namespace {  // one per source file, each compiled for its own instruction sets
+
 struct Avx512 {
   static constexpr int LANES = 16;
   static constexpr int TILE_OUTPUTS = 8, TILE_VECTORS = 3;  // accumulators of the perceptron: 24 of 32 registers
@@ -74,3 +76,5 @@ struct Avx512 {
     high = _mm512_permutex2var_ps(first, odds, second);
   }
 };
+
+}  // namespace

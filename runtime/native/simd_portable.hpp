@@ -4,11 +4,14 @@
 #include <cstdint>
 #include <cstring>
 
+namespace {  // one per source file, each compiled for its own instruction sets
+
 struct Portable {
   static constexpr int LANES = 4;
   static constexpr int TILE_OUTPUTS = 4, TILE_VECTORS = 2;  // accumulators of the perceptron: 8 of 16 registers
   typedef float F __attribute__((vector_size(16)));
   typedef int32_t I __attribute__((vector_size(16)));
+  typedef uint32_t U __attribute__((vector_size(16)));  // for what may overflow
   typedef double D __attribute__((vector_size(32)));
   typedef int64_t M __attribute__((vector_size(32)));
 
@@ -44,14 +47,14 @@ struct Portable {
   static I to_int(F v) { return __builtin_convertvector(v, I); }
   static F to_float(D v) { return __builtin_convertvector(v, F); }
 
-  static I add(I a, I b) { return a + b; }
-  static I mul(I a, I b) { return a * b; }
+  static I add(I a, I b) { return I(U(a) + U(b)); }
+  static I mul(I a, I b) { return I(U(a) * U(b)); }
   static I less(I a, I b) { return a < b; }
   static I equal(I a, I b) { return a == b; }
-  static I add_where(I where, I v, I amount) { return v + (where & amount); }
+  static I add_where(I where, I v, I amount) { return add(v, where & amount); }
   static I bit_and(I a, I b) { return a & b; }
-  template <int N> static I shift_left(I v) { return v << N; }
-  template <int N> static I shift_right(I v) { return v >> N; }
+  template <int N> static I shift_left(I v) { return I(U(v) << N); }
+  template <int N> static I shift_right(I v) { return I(U(v) >> N); }
   static F as_float(I v) { return load_as<F>(reinterpret_cast<const int32_t*>(&v)); }
 
   static F gather(const float* table, I index) {
@@ -66,3 +69,5 @@ struct Portable {
     high = gather(table + 1, index);
   }
 };
+
+}  // namespace

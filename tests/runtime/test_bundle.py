@@ -158,6 +158,25 @@ def test_nan_in_a_texture_file_is_refused(tmp_path, toy, toy_folder):
         load(tmp_path / "nan.sgt.npz", bundle=toy_folder)
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("noise_weights", lambda a: a[:, :1]),
+        ("noise_weights", np.ravel),
+        ("transforms", lambda a: a[:, None]),
+        ("transforms", lambda a: a[0, 0, 0]),
+        ("gamma", lambda a: a[None]),
+        ("delta", lambda a: np.concatenate([a, a[:2]])),
+    ],
+)
+def test_a_texture_of_other_shapes_is_refused(tmp_path, toy, toy_folder, name, change):
+    arrays = toy.data.arrays()
+    arrays[name] = change(arrays[name])
+    write_texture(tmp_path / "odd.sgt.npz", TextureData("toy", toy.data.sampler_sha256, **arrays))
+    with pytest.raises(BundleError, match=f"{name} of texture 'toy' has shape .* expected"):
+        load(tmp_path / "odd.sgt.npz", bundle=toy_folder)
+
+
 def test_a_model_that_returns_nan_is_an_error(tmp_path):
     weights = toy_weights()
     weights.weights[2][0, 0] = np.nan

@@ -60,4 +60,12 @@ def test_whoever_waits_is_let_go_by_a_cancel_from_another_thread():
     workers.cancel()
     waiting.join(2)
     assert found
-    workers.run([lambda: None, lambda: None])
+    with pytest.raises(CancelledError):
+        workers.run([lambda: None])
+
+
+def test_a_cancel_is_for_those_who_share_the_threads_alone():
+    workers, done = Workers(2), []
+    workers.share().cancel()
+    workers.run([partial(done.append, 1)])
+    assert done == [1]
