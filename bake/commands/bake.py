@@ -127,7 +127,7 @@ def describe(plan: Plan, texture: Texture) -> dict[str, Any]:
         "bytes_at_most": {str(output.path): output_bytes(output, plan.volume) for output in plan.outputs},
         "color_encoding": {str(output.path): encoding(output) for output in plan.outputs},
         "memory_bytes": plan.memory,
-        "seconds": round(plan.volume.voxels / rate, 1),
+        "seconds": round(plan.volume.voxels / rate, 3),
         "provider": texture.provider,
         "provider_note": texture.provider_note,
         "threads": texture.threads,
@@ -156,7 +156,7 @@ def summary(report: dict[str, Any]) -> str:
     ]
     lines += [
         f"memory    about {format_bytes(report['memory_bytes'])}",
-        f"time      about {report['seconds']:g} s on {report['threads']} threads, {report['provider']}",
+        f"time      about {report['seconds']:.3g} s on {report['threads']} threads, {report['provider']}",
     ]
     if report["tile_distortion"]:
         least, most = min(report["tile_distortion"]), max(report["tile_distortion"])

@@ -41,6 +41,8 @@ class ExrStack(Writer):
 
     def write(self, z: int, slab: FloatArray) -> None:
         self.workers.run([partial(self._write_slice, z + k, level) for k, level in enumerate(slab)])
+        for path in self.paths[z : z + len(slab)]:  # here, where waiting for the disk keeps no worker from evaluating
+            sync(self.staging / path.name)
 
     def _write_slice(self, z: int, rgb: FloatArray) -> None:
         import OpenEXR
@@ -51,7 +53,6 @@ class ExrStack(Writer):
             OpenEXR.File(slice_header(self.volume, z), {"RGB": np.ascontiguousarray(pixels)}).write(os.fspath(path))
         except RuntimeError as error:
             raise BakeError(f"{self.paths[z]}: cannot write ({error}); free space or bake elsewhere") from error
-        sync(path)
 
     def finish(self) -> None:
         """Nothing: each slice is whole as soon as it is written."""

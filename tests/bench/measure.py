@@ -65,9 +65,9 @@ def texture_rates(folder: Path, threads: int, path: str, precision: str = "float
         texture = load(folder, provider="auto", precision=precision, threads=threads)
         texture.grid((1, 8, 8)), texture.grid((1, 8, 8), tile="xyz", period=(256, 256, 256))
         return {
-            "grid": count / best(lambda: texture.grid(shape)),
-            "tiled": count / best(lambda: texture.grid(shape, tile="xyz", period=(256, 256, 256))),
-            "points": len(points) / best(lambda: texture.sample(points)),
+            "grid": count / best(lambda: texture.grid(shape), 2),
+            "tiled": count / best(lambda: texture.grid(shape, tile="xyz", period=(256, 256, 256)), 1),
+            "points": len(points) / best(lambda: texture.sample(points), 1),
         }
 
 
@@ -87,7 +87,7 @@ def graph_rate(folder: Path, threads: int, points: int = 2**16) -> float:
         "lattice": np.tile(64 * np.eye(3), (octaves, 1, 1)),
         "noise": noise_tables(0, octaves),
     }
-    return points / best(lambda: session.run(["rgb"], feed))
+    return points / best(lambda: session.run(["rgb"], feed), 2)
 
 
 def torch_rate(octaves: int, threads: int, points: int = 2**16) -> float:
@@ -104,7 +104,7 @@ def torch_rate(octaves: int, threads: int, points: int = 2**16) -> float:
     tables = torch.from_numpy(noise_tables(0, octaves))
     where = torch.from_numpy(slice_points(points) / 64).float()[None]
     with torch.no_grad():
-        return points / best(lambda: sampler(tables, where), 5)
+        return points / best(lambda: sampler(tables, where), 3)
 
 
 def torch_rate_without_avx512(octaves: int, threads: int) -> float:
@@ -142,7 +142,23 @@ def library_rate(octaves: int, precision: str, threads: int, points: int = 2**13
         return y @ last
 
     with torch.no_grad():
-        return points / best(perceptron, 20)
+        return points / best(perceptron, 10)
+
+
+def accuracy(name: str, ways: list[tuple[str, str]], edge: int = 216) -> dict[tuple[str, str], dict[str, float]]:
+    """A texture on (path, precision) against its ONNX graph, over ten million voxels: the largest difference, and the PSNR."""
+    graph, shape, textures = load(name, provider="cpu"), (edge, edge, edge), {}
+    for path, precision in ways:
+        with kernel_path(path):
+            textures[path, precision] = load(name, provider="kernel", precision=precision)
+    largest, squares = dict.fromkeys(ways, 0.0), dict.fromkeys(ways, 0.0)
+    slabs = zip(graph.slabs(shape, 1), *(texture.slabs(shape, 1) for texture in textures.values()), strict=True)
+    for (_, expected), *found in slabs:
+        for way, (_, slab) in zip(textures, found, strict=True):
+            difference = np.abs(slab.astype(np.float64) - expected)
+            largest[way] = max(largest[way], float(difference.max()))
+            squares[way] += float((difference**2).sum())
+    return {way: {"largest": largest[way], "psnr": -10 * float(np.log10(squares[way] / (3 * edge**3)))} for way in ways}
 
 
 def import_seconds() -> float:
