@@ -30,7 +30,8 @@ def main() -> None:
     report: dict[str, Any] = {"threads": threads[-1], "kernel_paths": kernel_paths()}
     report["rates"] = [row for octaves in (32, 16) for row in rates(octaves, threads)]
     report["start"] = start()
-    report["bakes"] = bakes(256 if not quick else 128)
+    report["bakes"] = bakes(128 if quick else 256, threads)
+    report["memory"] = depth(128 if quick else 256)
     report["scaling"] = scaling((64, 128, 256) if quick else (64, 128, 256, 512))
     report["accuracy"] = accuracy()
     REPORT.parent.mkdir(exist_ok=True)
@@ -94,38 +95,50 @@ def start() -> dict[str, float]:
     return found
 
 
-def bakes(size: int) -> list[dict[str, Any]]:
-    """End to end: whole bakes against the evaluation alone."""
-    heading(f"{size}³ of the embedded texture, end to end", "outputs", "seconds", "× evaluation alone", "Mvoxel/s", "peak MB")
+def bakes(size: int, threads: list[int]) -> list[dict[str, Any]]:
+    """End to end: whole bakes against the evaluation alone, half EXR and uint8 VTI."""
+    heading("Bakes, end to end", "n", "cube", "threads", "precision", "output", "seconds", "× evaluation alone", "peak MB")
+    precisions = ["float32", "bfloat16"] if kernel_paths()[0] in BFLOAT16_PATHS else ["float32"]
     rows = []
-    cases: list[tuple[str, tuple[str, ...], str]] = [
-        ("EXR half", (".####.exr",), "float32"),
-        ("VTI uint8", (".vti",), "float32"),
-        ("EXR + VTI", (".####.exr", ".vti"), "float32"),
-    ]
-    if kernel_paths()[0] in BFLOAT16_PATHS:
-        cases.append(("EXR half, bfloat16", (".####.exr",), "bfloat16"))
-    for what, suffixes, precision in cases:
-        alone = measure.evaluation_seconds(size, precision)
-        baked = measure.bake(str(size), *suffixes, options=("--precision", precision))
-        row = {
-            "outputs": what,
-            "seconds": round(baked["seconds"], 2),
-            "over_evaluation": round(baked["seconds"] / alone, 2),
-            "rate": round(size**3 / baked["seconds"] / MEGA, 2),
-            "peak_megabytes": round(baked["peak_memory_bytes"] / 2**20),
-        }
-        rows.append(row)
-        line(*row.values())
-    shallow, deep = (measure.bake(f"256x256x{depth}", ".vti")["peak_memory_bytes"] for depth in (64, 4 * size))
-    line(f"peak memory, 256×256×{4 * size} over 256×256×64", f"{deep / shallow:.2f}", "", "", "")
-    rows.append({"outputs": "peak memory, deep over shallow", "ratio": deep / shallow})
+    for octaves in (32, 16):
+        with measure.bundle(octaves) as folder:
+            for count in threads:
+                edge = size if count == threads[-1] else size // 2
+                for precision in precisions:
+                    alone = measure.evaluation_seconds(folder, edge, count, precision)
+                    for output in (".####.exr", ".vti"):
+                        options = ("--threads", str(count), "--precision", precision)
+                        baked = measure.bake(folder, str(edge), (output,), *options)
+                        row = {
+                            "octaves": octaves,
+                            "cube": f"{edge}³",
+                            "threads": count,
+                            "precision": precision,
+                            "output": output,
+                            "seconds": round(baked["seconds"], 2),
+                            "over_evaluation": round(baked["seconds"] / alone, 2),
+                            "peak_megabytes": round(baked["peak_memory_bytes"] / 2**20),
+                        }
+                        rows.append(row)
+                        line(*row.values())
     return rows
+
+
+def depth(size: int) -> dict[str, float]:
+    """That memory does not grow with depth."""
+    shallow, deep = (
+        measure.bake("granite", f"{size}x{size}x{slices}", (".####.exr", ".vti"))["peak_memory_bytes"]
+        for slices in (size // 4, 4 * size)
+    )
+    heading("Memory", "bake to EXR and VTI", "peak MB")
+    line(f"{size}×{size}×{size // 4}", round(shallow / 2**20))
+    line(f"{size}×{size}×{4 * size}", round(deep / 2**20))
+    return {"shallow": shallow, "deep": deep}
 
 
 def scaling(sizes: tuple[int, ...]) -> dict[int, float]:
     heading("Time per voxel against size, evaluation alone", "cube", "ns per voxel")
-    found = {size: measure.evaluation_seconds(size) / size**3 * 1e9 for size in sizes}
+    found = {size: measure.evaluation_seconds("granite", size) / size**3 * 1e9 for size in sizes}
     for size, nanoseconds in found.items():
         line(f"{size}³", f"{nanoseconds:.0f}")
     return found

@@ -172,19 +172,20 @@ def first_slab_seconds() -> float:
     return best(lambda: run([sys.executable, "-c", code]), 7)
 
 
-def bake(size: str, *suffixes: str, options: tuple[str, ...] = ()) -> dict[str, float]:
-    """What `solidgrain bake --json` reports, with the seconds of the whole process."""
+def bake(source: str | Path, size: str, suffixes: tuple[str, ...], *options: str) -> dict[str, float]:
+    """What `solidgrain bake --json` reports."""
     with tempfile.TemporaryDirectory() as folder:
         outputs = [word for suffix in suffixes for word in ("--out", f"{folder}/a{suffix}")]
-        report: dict[str, float] = json.loads(run([*CLI, "bake", "--size", size, "--json", "--quiet", *options, *outputs]))
+        command = [*CLI, "bake", str(source), "--size", size, "--json", "--quiet", *options, *outputs]
+        report: dict[str, float] = json.loads(run(command))
         return report
 
 
-def evaluation_seconds(size: int, precision: str = "float32") -> float:
-    """A cube of the embedded texture, evaluated slab by slab and thrown away."""
-    texture = load(precision=precision)
+def evaluation_seconds(source: str | Path, size: int, threads: int = 0, precision: str = "float32") -> float:
+    """A cube, evaluated slab by slab and thrown away."""
+    texture = load(source, threads=threads, precision=precision)
     texture.grid((1, 8, 8))
-    return best(lambda: [None for _ in texture.slabs((size, size, size))], 1)
+    return best(lambda: [None for _ in texture.slabs((size, size, size))], 2 if size < 256 else 1)
 
 
 def run(command: list[str], environment: dict[str, str] | None = None) -> str:
