@@ -12,6 +12,7 @@ from solidgrain.bake.plan import Plan
 from solidgrain.bake.writers import FloatArray, Writer, open_writer
 from solidgrain.runtime import Texture
 from solidgrain.runtime.errors import BakeError
+from solidgrain.runtime.workers import Workers
 
 OnSlice = Callable[[int, int], None]  # slices done, slices in all
 
@@ -37,7 +38,7 @@ def bake(plan: Plan, texture: Texture, on_slice: OnSlice = lambda done, total: N
     try:
         for output in plan.outputs:
             writers.append(open_writer(output, plan.volume, workers))
-        evaluation = _feed(plan, texture, writers, on_slice)
+        evaluation = _feed(plan, texture, writers, workers, on_slice)
         for writer in writers:
             writer.finish()
         files = [path for writer in writers for path in writer.commit()]
@@ -54,8 +55,11 @@ def _culprit(error: OSError, plan: Plan) -> str:
     return str(error.filename2 or error.filename or ", ".join(str(output.path) for output in plan.outputs))
 
 
-def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], on_slice: OnSlice) -> float:
-    """All slabs to all writers: one slab is written while the next is evaluated. Returns the seconds spent in the sampler."""
+def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], workers: Workers, on_slice: OnSlice) -> float:
+    """All slabs to all writers: one slab is written while the next is evaluated. Returns the seconds spent in the sampler.
+
+    `workers` are the writers': they are cancelled if anything goes wrong.
+    """
     depth, evaluation = plan.volume.shape[0], 0.0
     writing: Future[None] | None = None
 
@@ -80,7 +84,6 @@ def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], on_slice: OnS
             if writing is not None:
                 writing.result()
         except BaseException:
-            for writer in writers:
-                writer.workers.cancel()  # or leaving would wait for all that they have begun
+            workers.cancel()  # or leaving would wait for all that they have begun
             raise
     return evaluation

@@ -15,6 +15,8 @@ Each message is one line: the flag or file, what was expected, what was found, w
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 class SolidgrainError(Exception):
     """Base of all errors that solidgrain raises on purpose."""
@@ -42,6 +44,12 @@ class ProviderError(SolidgrainError):
 
 class EvaluationError(SolidgrainError):
     """The sampler returned NaN, or was asked for something that it cannot evaluate."""
+
+    @classmethod
+    def of_nan(cls, texture: str, point: Iterable[float]) -> EvaluationError:
+        """That the sampler returned NaN at a finite point (x, y, z)."""
+        x, y, z = point
+        return cls(f"{texture}: the sampler returned NaN at ({x:g}, {y:g}, {z:g}); the texture is damaged")
 
 
 class BakeError(SolidgrainError):

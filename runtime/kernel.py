@@ -151,8 +151,7 @@ class KernelInstance:
     def _fail(self, found: int, place: Sequence[float]) -> None:
         if found < 0:
             raise EvaluationError(f"{self.name}: not enough memory for the fused kernel")
-        x, y, z = place
-        raise EvaluationError(f"{self.name}: the sampler returned NaN at ({x:g}, {y:g}, {z:g}); the texture is damaged")
+        raise EvaluationError.of_nan(self.name, place)
 
 
 def _library_file() -> Path:

@@ -100,6 +100,5 @@ class OnnxInstance:
         except Exception as error:  # ONNX Runtime raises types of its own, without a common base
             raise EvaluationError(f"{self.name}: ONNX Runtime failed ({str(error).strip().splitlines()[0]})") from error
         if not np.isfinite(rgb).all():
-            x, y, z = points[np.flatnonzero(~np.isfinite(rgb).all(axis=1))[0]]
-            raise EvaluationError(f"{self.name}: the sampler returned NaN at ({x:g}, {y:g}, {z:g}); the texture is damaged")
+            raise EvaluationError.of_nan(self.name, points[np.flatnonzero(~np.isfinite(rgb).all(axis=1))[0]])
         return np.clip(rgb, 0.0, 1.0)

@@ -60,7 +60,7 @@ def open_session(path: Path, provider: str) -> onnxruntime.InferenceSession:
     import onnxruntime
 
     offered = {name.removesuffix(SUFFIX).lower(): name for name in onnxruntime.get_available_providers()}
-    full_name = offered.get(ALIASES.get(provider.lower(), provider.lower()))
+    full_name = offered.get(ALIASES.get(provider, provider))
     if full_name is None:
         raise ProviderError(
             f"provider {provider!r}: expected auto, kernel, or one that onnxruntime {onnxruntime.__version__} has: "

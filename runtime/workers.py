@@ -12,16 +12,14 @@ Task = Callable[[], None]
 class Workers:
     """Runs short tasks, several at a time. The work is in native code that lets go of the interpreter."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, pool: _Pool | None = None) -> None:
         self.count = count
-        self._pool = _Pool(count)
+        self._pool = pool or _Pool(count)
         self._cancelled = False
 
     def share(self) -> Workers:
         """The same threads, to be cancelled on their own."""
-        others = Workers(self.count)
-        others._pool = self._pool
-        return others
+        return Workers(self.count, self._pool)
 
     def run(self, tasks: Sequence[Task]) -> None:
         """All tasks, in any order. The first error, or an interrupt, stops those that have not begun and is raised."""

@@ -80,8 +80,6 @@ void fill_table(const float* noise, bool bfloat16, void* table) {
     }
 }
 
-int layer_inputs(const Layer& layer) { return layer.units + layer.octaves; }
-
 // The numbers of layer l and where its weights begin; returns where the next layer's do.
 const float* describe(const Sampler& sampler, int l, const float* weights, Layer& layer) {
   layer.units = l == 0 ? 0 : sampler.width;
@@ -89,7 +87,7 @@ const float* describe(const Sampler& sampler, int l, const float* weights, Layer
   layer.outputs = l == sampler.hidden_layers ? 3 : sampler.width;
   layer.bias = weights;
   layer.weights = weights + layer.outputs;
-  return layer.weights + size_t(layer_inputs(layer)) * layer.outputs;
+  return layer.weights + size_t(layer.units + layer.octaves) * layer.outputs;
 }
 
 // The memory of one call: a sweep's coordinates, noise and colours, and what the path needs.

@@ -26,7 +26,7 @@ inline void table_corners(const typename S::D (&at)[3], typename S::I (&low)[4],
   for (int axis = 0; axis < 3; axis++) {
     auto turns = S::floor(S::mul(at[axis], S::all(1.0 / RESOLUTION)));
     auto inside = S::fma(turns, S::all(-double(RESOLUTION)), at[axis]);
-    if (coarse) {  // to 2^-18 of a texel, for bfloat16
+    if constexpr (coarse) {  // to 2^-18 of a texel, for bfloat16
       auto rounded = S::to_float(inside);
       auto whole = S::floor(rounded);
       cell[axis] = S::to_int(whole);
@@ -202,7 +202,7 @@ void look_up_octave(const Octave& octave, bool far, const double* x, const doubl
 }
 
 // Whether products of cells and basis entries may reach 2^50 somewhere in this sweep.
-template <class S> bool is_far(const Octave& octave, const double (&farthest)[3]) {
+inline bool is_far(const Octave& octave, const double (&farthest)[3]) {
   double cells = 0, entries = 0;
   for (int axis = 0; axis < 3; axis++) {
     double reach = std::fabs(octave.offset[axis]) + 2;
@@ -221,7 +221,7 @@ template <class S, bool pairs> void look_up(const Sampler& sampler, const double
     for (int i = 0; i < count; i++) farthest[axis] = std::fabs(along[axis][i]) > farthest[axis] ? std::fabs(along[axis][i]) : farthest[axis];
   for (int i = 0; i < sampler.octaves; i++, eta += STRIDE) {
     const Octave& octave = sampler.octave[i];
-    bool far = sampler.tiled && is_far<S>(octave, farthest);
+    bool far = sampler.tiled && is_far(octave, farthest);
     auto run = sampler.tiled ? look_up_octave<S, FloatTable<S>, true> : look_up_octave<S, FloatTable<S>, false>;
     if constexpr (pairs)
       if (sampler.bfloat16) run = sampler.tiled ? look_up_octave<S, PairTable<S>, true> : look_up_octave<S, PairTable<S>, false>;

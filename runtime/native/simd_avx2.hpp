@@ -26,12 +26,10 @@ struct Avx2 {
   static F fma(F a, F b, F c) { return _mm256_fmadd_ps(a, b, c); }
   static D fma(D a, D b, D c) { return {_mm256_fmadd_pd(a.low, b.low, c.low), _mm256_fmadd_pd(a.high, b.high, c.high)}; }
   static F sub(F a, F b) { return _mm256_sub_ps(a, b); }
-  static F floor(F v) { return _mm256_floor_ps(v); }
   static F leaky(F v, F slope) { return _mm256_max_ps(v, _mm256_mul_ps(v, slope)); }
   static D add(D a, D b) { return {_mm256_add_pd(a.low, b.low), _mm256_add_pd(a.high, b.high)}; }
   static D sub(D a, D b) { return {_mm256_sub_pd(a.low, b.low), _mm256_sub_pd(a.high, b.high)}; }
   static D mul(D a, D b) { return {_mm256_mul_pd(a.low, b.low), _mm256_mul_pd(a.high, b.high)}; }
-  static D div(D a, D b) { return {_mm256_div_pd(a.low, b.low), _mm256_div_pd(a.high, b.high)}; }
   static D floor(D v) { return {_mm256_floor_pd(v.low), _mm256_floor_pd(v.high)}; }
   static M less(D a, D b) { return {_mm256_cmp_pd(a.low, b.low, _CMP_LT_OQ), _mm256_cmp_pd(a.high, b.high, _CMP_LT_OQ)}; }
   static M equal(D a, D b) { return {_mm256_cmp_pd(a.low, b.low, _CMP_EQ_OQ), _mm256_cmp_pd(a.high, b.high, _CMP_EQ_OQ)}; }
@@ -39,7 +37,6 @@ struct Avx2 {
     return add(v, D{_mm256_and_pd(where.low, amount.low), _mm256_and_pd(where.high, amount.high)});
   }
   static I to_int(D v) { return _mm256_set_m128i(_mm256_cvttpd_epi32(v.high), _mm256_cvttpd_epi32(v.low)); }
-  static I to_int(F v) { return _mm256_cvttps_epi32(v); }
   static F to_float(D v) { return _mm256_set_m128(_mm256_cvtpd_ps(v.high), _mm256_cvtpd_ps(v.low)); }
 
   static I add(I a, I b) { return _mm256_add_epi32(a, b); }
@@ -48,14 +45,9 @@ struct Avx2 {
   static I equal(I a, I b) { return _mm256_cmpeq_epi32(a, b); }
   static I add_where(I where, I v, I amount) { return add(v, bit_and(where, amount)); }
   static I bit_and(I a, I b) { return _mm256_and_si256(a, b); }
-  template <int N> static I shift_left(I v) { return _mm256_slli_epi32(v, N); }
   template <int N> static I shift_right(I v) { return _mm256_srli_epi32(v, N); }
-  static F as_float(I v) { return _mm256_castsi256_ps(v); }
 
   static F gather(const float* table, I index) { return _mm256_i32gather_ps(table, index, 4); }
-  static I gather(const uint32_t* table, I index) {
-    return _mm256_i32gather_epi32(reinterpret_cast<const int*>(table), index, 4);
-  }
   // Two neighbours in one read of 64 bits each: low = table[index], high = table[index + 1].
   static void gather_pair(const float* table, I index, F& low, F& high) {
     const double* base = reinterpret_cast<const double*>(table);

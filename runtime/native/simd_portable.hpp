@@ -27,15 +27,10 @@ struct Portable {
   static F fma(F a, F b, F c) { return a * b + c; }
   static D fma(D a, D b, D c) { return a * b + c; }
   static F sub(F a, F b) { return a - b; }
-  static F floor(F v) {
-    F whole = __builtin_convertvector(__builtin_convertvector(v, I), F);
-    return whole - (whole > v ? all(1.0f) : all(0.0f));
-  }
   static F leaky(F v, F slope) { return v > 0 ? v : v * slope; }
   static D add(D a, D b) { return a + b; }
   static D sub(D a, D b) { return a - b; }
   static D mul(D a, D b) { return a * b; }
-  static D div(D a, D b) { return a / b; }
   static D floor(D v) {
     D whole = __builtin_convertvector(__builtin_convertvector(v, M), D);
     return whole - (whole > v ? all(1.0) : all(0.0));
@@ -44,7 +39,6 @@ struct Portable {
   static M equal(D a, D b) { return a == b; }
   static D add_where(M where, D v, D amount) { return where ? v + amount : v; }
   static I to_int(D v) { return __builtin_convertvector(v, I); }
-  static I to_int(F v) { return __builtin_convertvector(v, I); }
   static F to_float(D v) { return __builtin_convertvector(v, F); }
 
   static I add(I a, I b) { return I(U(a) + U(b)); }
@@ -53,15 +47,10 @@ struct Portable {
   static I equal(I a, I b) { return a == b; }
   static I add_where(I where, I v, I amount) { return add(v, where & amount); }
   static I bit_and(I a, I b) { return a & b; }
-  template <int N> static I shift_left(I v) { return I(U(v) << N); }
   template <int N> static I shift_right(I v) { return I(U(v) >> N); }
-  static F as_float(I v) { return load_as<F>(reinterpret_cast<const int32_t*>(&v)); }
 
   static F gather(const float* table, I index) {
     return F{table[index[0]], table[index[1]], table[index[2]], table[index[3]]};
-  }
-  static I gather(const uint32_t* table, I index) {
-    return I{int32_t(table[index[0]]), int32_t(table[index[1]]), int32_t(table[index[2]]), int32_t(table[index[3]])};
   }
   // Two neighbours at once: low = table[index], high = table[index + 1].
   static void gather_pair(const float* table, I index, F& low, F& high) {
