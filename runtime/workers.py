@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
 
@@ -23,10 +24,10 @@ class Workers:
 
     def run(self, tasks: Sequence[Task]) -> None:
         """All tasks, in any order. The first error, or an interrupt, stops those that have not begun and is raised."""
-        executor, futures = self._pool.executor(), []
+        executor, futures, failed = self._pool.executor(), [], threading.Event()
         try:
             for task in tasks:
-                futures.append(executor.submit(self._call, task))
+                futures.append(executor.submit(self._call, task, failed))
             wait(futures, return_when=FIRST_EXCEPTION)
             for future in futures:
                 if future.done():
@@ -38,10 +39,16 @@ class Workers:
         """Skip what has not begun, for good: whoever waits in `run`, or calls it later, gets a CancelledError."""
         self._cancelled = True
 
-    def _call(self, task: Task) -> None:
+    def _call(self, task: Task, failed: threading.Event) -> None:
+        """A task, unless one before it has failed: its thread is the first to know, long before whoever waits in `run`."""
         if self._cancelled:
             raise CancelledError
-        task()
+        if not failed.is_set():
+            try:
+                task()
+            except BaseException:
+                failed.set()
+                raise
 
 
 class _Pool:
