@@ -65,3 +65,43 @@ def parse_minutes(text: str) -> float:
     if not 0 < minutes < math.inf:
         raise argparse.ArgumentTypeError(f"expected minutes above 0, found {text!r}")
     return minutes
+
+
+def _numbers(text: str, count: int) -> list[float]:
+    """So many finite numbers, separated by commas or spaces; none if they are not."""
+    try:
+        numbers = [float(part) for part in text.replace(",", " ").split()]
+    except ValueError:
+        return []
+    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else []
+
+
+def parse_box(text: str) -> tuple[float, ...]:
+    """Both corners, the lower one first."""
+    numbers = _numbers(text, 6)
+    if not numbers or not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+        raise argparse.ArgumentTypeError(f"expected X,Y,Z,X,Y,Z, the lower corner and the upper one, found {text!r}")
+    return tuple(numbers)
+
+
+def parse_matrix(text: str) -> tuple[tuple[float, ...], ...]:
+    """A placement, 4x4."""
+    numbers = _numbers(text, 16)
+    if not numbers or numbers[12:] != [0, 0, 0, 1]:
+        raise argparse.ArgumentTypeError(f"expected 16 numbers, row by row, the last four 0,0,0,1, found {text!r}")
+    return tuple(tuple(numbers[4 * row : 4 * row + 4]) for row in range(4))
+
+
+def parse_pixel_size(text: str) -> float:
+    numbers = _numbers(text, 1)
+    if not numbers or numbers[0] <= 0:
+        raise argparse.ArgumentTypeError(f"expected metres, above 0, found {text!r}")
+    return numbers[0]
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """ "3/8": the third of eight."""
+    number, slash, count = text.partition("/")
+    if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise argparse.ArgumentTypeError(f"expected I/N with I from 1 to N, such as 3/8, found {text!r}")
+    return int(number), int(count)

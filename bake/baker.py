@@ -1,20 +1,30 @@
-"""Running a plan: slabs are evaluated in order and handed to every writer, one slab ahead of them."""
+"""Running a plan: slabs are evaluated in order and handed to every writer, one slab ahead of them.
+
+What writers make of the slabs gathers in a staging folder beside each output. When all slabs are there the writers assemble
+their files, and only when all files of all outputs are whole are they put in place. A bake that was killed takes up what the
+stagings hold; a shard stops after its slabs, and `merge` does the rest.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from solidgrain.bake.evaluate import evaluate
+from solidgrain.bake.manifest import manifest_path, write_manifest
 from solidgrain.bake.plan import Plan
-from solidgrain.bake.writers import FloatArray, Writer, open_writer
+from solidgrain.bake.staging import Staging, open_staging
+from solidgrain.bake.writers import FloatArray, Output, Writer, open_writer
 from solidgrain.runtime import Texture
 from solidgrain.runtime.errors import BakeError
 from solidgrain.runtime.workers import Workers
 
 OnSlice = Callable[[int, int], None]  # slices done, slices in all
+Shard = tuple[int, int]  # slices first .. stop - 1
 
 
 @dataclass(frozen=True)
@@ -23,31 +33,88 @@ class Baked:
 
     files: list[Path]
     seconds: float
-    evaluation_seconds: float  # of them, in the sampler
+    evaluation_seconds: float = 0.0  # of them, in the sampler
+    reused_slices: int = 0  # that an earlier bake had evaluated
 
 
-def bake(plan: Plan, texture: Texture, on_slice: OnSlice = lambda done, total: None) -> Baked:
+@dataclass(frozen=True)
+class Job:
+    """One output while it is baked."""
+
+    output: Output
+    writer: Writer
+    staging: Staging
+
+    @property
+    def done(self) -> set[int]:
+        """The first slices of its slabs that are written."""
+        return {record.z for record in self.staging.records}
+
+
+def bake(
+    plan: Plan,
+    texture: Texture,
+    on_slice: OnSlice = lambda done, total: None,
+    *,
+    resume: bool = False,
+    shard: Shard | None = None,
+) -> Baked:
     """Evaluate a plan and write its outputs, all of them or none.
 
-    Raises BakeError if a file cannot be written, EvaluationError if the texture returns NaN; then, as after an interrupt,
-    nothing is left behind.
+    With `resume`, what an earlier bake of the same plan has left is taken up, and what this one leaves when it fails stays;
+    otherwise nothing is left behind. A `shard` bakes slices first .. stop - 1 and leaves the rest to others and to `merge`.
+    Raises BakeError if a file cannot be written or another process is baking it, EvaluationError if the texture returns NaN.
     """
-    writers: list[Writer] = []
-    workers = texture.workers.share()
+    started, workers = time.monotonic(), texture.workers.share()
+    evaluation, reused = 0.0, plan.size[2]
+    with _jobs(plan, workers, shard, keep=resume or shard is not None) as jobs:
+        if not all(job.staging.finished() for job in jobs):
+            for job in jobs:
+                job.staging.restore()
+            reused = min((job.staging.slices for job in jobs), default=0)
+            evaluation = _feed(plan, texture, jobs, workers, shard or (0, plan.size[2]), on_slice)
+        files = _complete(plan, jobs) if shard is None else []
+    return Baked(files, time.monotonic() - started, evaluation, reused)
+
+
+def merge(plan: Plan, workers: Workers) -> Baked:
+    """Complete a plan whose shards have all been baked. Raises BakeError that names the slices that are missing."""
     started = time.monotonic()
+    with _jobs(plan, workers, None, keep=True) as jobs:
+        if not all(job.staging.finished() for job in jobs):
+            for job in jobs:
+                job.staging.gather()
+                if gaps := job.staging.missing():
+                    runs = ", ".join(f"{first} to {stop - 1}" for first, stop in gaps)
+                    raise BakeError(f"{job.output.path}: slices {runs} are missing or damaged; bake their shards first")
+        files = _complete(plan, jobs)
+    return Baked(files, time.monotonic() - started, reused_slices=plan.size[2])
+
+
+@contextmanager
+def _jobs(plan: Plan, workers: Workers, shard: Shard | None, keep: bool) -> Iterator[list[Job]]:
+    """The outputs of a plan, each with its locked staging; what is there and what an error leaves is kept, or forgotten.
+
+    An OSError becomes a BakeError that names the file.
+    """
+    jobs: list[Job] = []
     try:
         for output in plan.outputs:
-            writers.append(open_writer(output, plan.volume, workers))
-        evaluation = _feed(plan, texture, writers, workers, on_slice)
-        for writer in writers:
-            writer.finish()
-        files = [path for writer in writers for path in writer.commit()]
-    except OSError as error:
-        raise BakeError(f"cannot write {_culprit(error, plan)}: {error.strerror}; free space or bake elsewhere") from error
+            writer = open_writer(output, plan.volume, workers)
+            staging = open_staging(output.path, plan.work(output), plan.size[2], writer.reserved, shard, fresh=not keep)
+            jobs.append(Job(output, writer, staging))
+        yield jobs
+    except BaseException as error:
+        if not keep:
+            for job in jobs:
+                job.staging.clear()
+        if isinstance(error, OSError):
+            culprit = _culprit(error, plan)
+            raise BakeError(f"cannot write {culprit}: {error.strerror}; free space or bake elsewhere") from error
+        raise
     finally:
-        for writer in writers:
-            writer.abort()  # nothing to do for those that have committed
-    return Baked(files, time.monotonic() - started, evaluation)
+        for job in jobs:
+            job.staging.close()
 
 
 def _culprit(error: OSError, plan: Plan) -> str:
@@ -55,35 +122,65 @@ def _culprit(error: OSError, plan: Plan) -> str:
     return str(error.filename2 or error.filename or ", ".join(str(output.path) for output in plan.outputs))
 
 
-def _feed(plan: Plan, texture: Texture, writers: Sequence[Writer], workers: Workers, on_slice: OnSlice) -> float:
-    """All slabs to all writers: one slab is written while the next is evaluated. Returns the seconds spent in the sampler.
+def _complete(plan: Plan, jobs: Sequence[Job]) -> list[Path]:
+    """Assemble all files, then put them in place. A kill at any point leaves the next bake with the rest of it to do."""
+    finished = [job.staging.finished() or job.staging.finish(job.writer.assemble(job.staging)) for job in jobs]
+    files: list[Path] = []
+    for job, lines in zip(jobs, finished, strict=True):
+        manifest_path(job.output.path).unlink(missing_ok=True)  # of files that are about to be replaced
+        files += job.staging.commit(lines)
+        write_manifest(plan, job.output, lines)
+        job.staging.clear()
+    return files
 
-    `workers` are the writers': they are cancelled if anything goes wrong.
+
+def _feed(plan: Plan, texture: Texture, jobs: Sequence[Job], workers: Workers, shard: Shard, on_slice: OnSlice) -> float:
+    """The slabs that any output lacks, to those that lack them: one is written while the next is evaluated.
+
+    Returns the seconds spent in the sampler. `workers` are the writers': they are cancelled if anything goes wrong.
     """
-    depth, evaluation = plan.volume.shape[0], 0.0
+    evaluation = 0.0
     writing: Future[None] | None = None
+    done = [job.done for job in jobs]
+    wanted = [z for z in range(*shard, plan.slab) if any(z not in slabs for slabs in done)]
+    total, left = shard[1] - shard[0], sum(min(plan.slab, shard[1] - z) for z in wanted)
 
     def write(z: int, slab: FloatArray) -> None:
-        for writer in writers:
-            writer.write(z, slab)
-        on_slice(z + len(slab), depth)
+        nonlocal left
+        for job, slabs in zip(jobs, done, strict=True):
+            if z not in slabs:
+                job.staging.append(z, len(slab), job.writer.encode(z, slab))
+        left -= len(slab)
+        on_slice(total - left, total)
 
     with ThreadPoolExecutor(1, thread_name_prefix="solidgrain-writers") as hand:
         try:
-            waiting_since = time.monotonic()
-            slabs = texture.slabs(
-                plan.volume.shape, plan.seed, origin=plan.origin, spacing=plan.spacing, tile=plan.tile, slab=plan.slab
-            )
-            for z, slab in slabs:
-                evaluation += time.monotonic() - waiting_since
-                if writing is not None:
-                    writing.result()
-                writing = hand.submit(write, z, slab)
-                del slab  # or it would live while the next but one is made
+            for first, stop in _runs(wanted, plan.slab, shard[1]):
                 waiting_since = time.monotonic()
+                for z, slab in evaluate(plan, texture, first, stop):
+                    evaluation += time.monotonic() - waiting_since
+                    if writing is not None:
+                        writing.result()
+                    writing = hand.submit(write, z, slab)
+                    del slab  # or it would live while the next but one is made
+                    waiting_since = time.monotonic()
             if writing is not None:
                 writing.result()
         except BaseException:
             workers.cancel()  # or leaving would wait for all that they have begun
             raise
     return evaluation
+
+
+def _runs(slabs: Sequence[int], thickness: int, stop: int) -> Iterator[Shard]:
+    """Slabs that follow each other, joined: slices (first, stop)."""
+    first = last = None
+    for z in slabs:
+        if first is None or last is None:
+            first = z
+        elif z != last + thickness:
+            yield first, last + thickness
+            first = z
+        last = z
+    if first is not None and last is not None:
+        yield first, min(last + thickness, stop)

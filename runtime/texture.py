@@ -164,16 +164,18 @@ class Texture:
         spacing: float | Sequence[float] = 1.0,
         tile: str = "",
         period: Sequence[int] | None = None,
+        transform: npt.ArrayLike | None = None,
     ) -> FloatArray:
         """Colour on a voxel grid of shape (z, y, x) -> [z, y, x, 3] float32 in [0, 1], sRGB-encoded.
 
         `origin` (x, y, z) and `spacing` (one number or x, y, z) are in exemplar pixels; voxel k of an axis is at
         origin + (k + 0.5) spacing. `tile` names the axes that repeat seamlessly, any subset of "xyz", with `period`
-        (z, y, x) in voxels, by default the grid's own shape. Raises EvaluationError for a shape, spacing, period or
-        origin that makes no sense.
+        (z, y, x) in voxels, by default the grid's own shape. `transform` [4, 4] places the grid in the texture: the voxel
+        at p has the colour of M p, column vectors (x, y, z, 1). Raises EvaluationError for a shape, spacing, period,
+        origin or transform that makes no sense.
         """
         volume = np.empty((*_positive("shape", shape), 3), np.float32)
-        for z, slab in self.slabs(shape, seed, origin=origin, spacing=spacing, tile=tile, period=period):
+        for z, slab in self.slabs(shape, seed, origin=origin, spacing=spacing, tile=tile, period=period, transform=transform):
             volume[z : z + len(slab)] = slab
         return volume
 
@@ -186,27 +188,38 @@ class Texture:
         spacing: float | Sequence[float] = 1.0,
         tile: str = "",
         period: Sequence[int] | None = None,
+        transform: npt.ArrayLike | None = None,
         slab: int = SLAB,
+        slices: tuple[int, int] | None = None,
     ) -> Iterator[tuple[int, FloatArray]]:
         """The same grid as runs of whole slices, in order: pairs of first slice and [<= slab, y, x, 3].
 
-        Memory is bounded by the slab, whatever the depth. Arguments and errors as in `grid`.
+        `slices` (first, stop) are all of it, or the part that is wanted. Memory is bounded by the slab, whatever the
+        depth. Other arguments and errors as in `grid`.
         """
         depth, rows, columns = _positive("shape", shape)
         (thickness,) = _whole("slab", (slab,), count=1, least=1)
+        low, high = (0, depth) if slices is None else _whole("slices", slices, count=2, least=0)
+        if not low <= high <= depth:
+            raise EvaluationError(f"slices {slices}: expected first and stop, from 0 to {depth}")
+        matrix = _affine(transform)
         start, step = _finite("origin", origin), _spacing(spacing)
-        tiling = self.tiling(shape, spacing=spacing, tile=tile, period=period)
+        tiling = self.tiling(shape, spacing=spacing, tile=tile, period=period, transform=transform)
+        shift = np.linalg.solve(matrix[:3, :3], matrix[:3, 3])  # M p + t = M (p + shift)
+        start = (start[0] + shift[0], start[1] + shift[1], start[2] + shift[2])
         ends = [start[axis] + step[axis] * count for axis, count in enumerate((columns, rows, depth))]
         farthest = [max(abs(first), abs(last)) for first, last in zip(start, ends, strict=True)]
-        if max(farthest) > FARTHEST:
-            raise EvaluationError(f"grid reaches {max(farthest):g} pixels from the origin, expected at most {FARTHEST:g}")
+        reach = max(*farthest, *(np.abs(matrix[:3, :3]) @ farthest))
+        if reach > FARTHEST:
+            raise EvaluationError(f"grid reaches {reach:g} pixels from the origin, expected at most {FARTHEST:g}")
         tiling.check_exact((farthest[0], farthest[1], farthest[2]))
         instance = self._instance(tiling, seed)
         x, y, z = (
             tiling.wrap(start[axis] + (np.arange(count, dtype=np.float64) + 0.5) * step[axis], axis)
             for axis, count in enumerate((columns, rows, depth))
         )
-        return ((first, self._slab(instance, x, y, z[first : first + thickness])) for first in range(0, depth, thickness))
+        z = z[:high]
+        return ((first, self._slab(instance, x, y, z[first : first + thickness])) for first in range(low, high, thickness))
 
     def _slab(self, instance: Instance, x: DoubleArray, y: DoubleArray, z: DoubleArray) -> FloatArray:
         rgb = np.empty((len(z), len(y), len(x), 3), np.float32)
@@ -220,11 +233,13 @@ class Texture:
         spacing: float | Sequence[float] = 1.0,
         tile: str = "",
         period: Sequence[int] | None = None,
+        transform: npt.ArrayLike | None = None,
     ) -> Tiling:
         """How tiling moves this texture's transforms for such a grid, and by how much (`distortion`)."""
         voxels = _positive("period", shape if period is None else period)
         step = _spacing(spacing)
-        return tiled(self.transforms, (voxels[2] * step[0], voxels[1] * step[1], voxels[0] * step[2]), tile)
+        transforms = self.transforms if transform is None else self.transforms @ _affine(transform)[:3, :3]
+        return tiled(transforms, (voxels[2] * step[0], voxels[1] * step[1], voxels[0] * step[2]), tile)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Save the texture alone (~25 KB); it loads wherever its bundle can be found."""
@@ -266,6 +281,19 @@ def _finite(name: str, values: Sequence[float]) -> Vector:
     if len(numbers) != 3 or not np.isfinite(numbers).all():
         raise EvaluationError(f"{name} {values}: expected three finite numbers (x, y, z)")
     return (numbers[0], numbers[1], numbers[2])
+
+
+def _affine(transform: npt.ArrayLike | None) -> DoubleArray:
+    """A placement [4, 4] in float64, the identity for None."""
+    try:
+        matrix = np.eye(4) if transform is None else np.array(transform, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
+        raise EvaluationError("transform: expected 4x4 finite numbers with the last row 0, 0, 0, 1")
+    if abs(np.linalg.det(matrix[:3, :3])) < 1e-9 * np.abs(matrix[:3, :3]).max() ** 3:
+        raise EvaluationError("transform: its 3x3 part has no inverse, expected one that keeps space three-dimensional")
+    return matrix
 
 
 def _spacing(spacing: float | Sequence[float]) -> Vector:

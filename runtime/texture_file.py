@@ -7,6 +7,7 @@ a name, and the sha256 of the sampler that the numbers belong to. Equal textures
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import zipfile
@@ -36,6 +37,14 @@ class TextureData:
 
     def arrays(self) -> dict[str, npt.NDArray[np.generic]]:
         return {name: getattr(self, name) for name in ARRAYS}
+
+    @property
+    def sha256(self) -> str:
+        """Of all values: two textures of one bundle differ in it."""
+        digest = hashlib.sha256(self.sampler_sha256.encode())
+        for array in self.arrays().values():
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
 
 
 ARRAYS = {"transforms": np.float64, "gamma": np.float32, "delta": np.float32, "noise_weights": np.float32}

@@ -1,8 +1,11 @@
 """The table of writers, from suffix to file format, and the little that all formats share."""
 
-from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer
+from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer, replay
 from solidgrain.bake.writers.table import (
-    encoding,
+    PREVIEW,
+    check_output,
+    formats,
+    kind_of,
     make_output,
     open_writer,
     output_bytes,
@@ -12,15 +15,20 @@ from solidgrain.bake.writers.table import (
 )
 
 __all__ = [
+    "PREVIEW",
     "FloatArray",
+    "Option",
     "Output",
     "Volume",
     "Writer",
-    "encoding",
+    "check_output",
+    "formats",
+    "kind_of",
     "make_output",
     "open_writer",
     "output_bytes",
     "output_exists",
     "output_files",
+    "replay",
     "suffixes",
 ]

@@ -1,19 +1,24 @@
-"""What a writer is: it takes slabs in order and leaves a complete file behind, or none."""
+"""What a writer is: it turns slabs into bytes, and the bytes of all slabs into complete files.
+
+A bake may be killed and resumed, and its slabs may be encoded by several processes. So a writer keeps nothing between two
+calls: `encode` depends on its slab alone, and `assemble` reads what the store has of all of them.
+"""
 
 from __future__ import annotations
 
 import os
+import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.runtime.files import temporary_name
+from solidgrain.bake.color import from_srgb, quantize, triangular
+from solidgrain.bake.store import Bytes, Encoded, Finished, Store
 from solidgrain.runtime.workers import Workers
 
 FloatArray = npt.NDArray[np.float32]
@@ -30,6 +35,8 @@ class Volume:
     sampler_sha256: str
     seed: int
     tile: str
+    axes: str = "+x+y+z"  # which axes of the texture (x, y, z) of this grid are, with their signs
+    level: int = 0  # in the mip chain
 
     @property
     def voxels(self) -> int:
@@ -50,57 +57,95 @@ class Output:
     kind: str  # suffix in the table, or "preview"
     options: dict[str, str | int] = field(default_factory=dict)
 
+    @property
+    def colorspace(self) -> str:
+        return str(self.options["colorspace"])
+
+
+class Option(NamedTuple):
+    """One setting of a format: an entry in an output's options, and a flag `--<format>-<name>` of the command line."""
+
+    name: str
+    default: str | int
+    help: str
+    choices: tuple[str, ...] = ()  # empty: any text, or any whole number if the default is one
+
 
 class Writer(ABC):
-    """Takes the slabs of a volume in order. Nothing is visible under its final name before `commit`.
-
-    Slow work goes to `workers`, the threads that also evaluate the texture.
-    """
+    """One output. Slow work goes to `workers`, the threads that also evaluate the texture."""
 
     def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
         self.output, self.volume, self.workers = output, volume, workers
 
-    @abstractmethod
-    def write(self, z: int, slab: FloatArray) -> None:
-        """One slab: slices z, z + 1, ..., [<= slab, y, x, 3] in [0, 1], sRGB-encoded."""
+    @property
+    def reserved(self) -> int:
+        """Bytes that the store keeps free before the first slab's, for a header."""
+        return 0
 
     @abstractmethod
-    def finish(self) -> None:
-        """Complete the files, still under temporary names, down to the disk. All that can fail has failed after this."""
+    def encode(self, z: int, slab: FloatArray) -> Encoded:
+        """Slices z, z + 1, ..., [<= slab, y, x, 3] in [0, 1], sRGB-encoded, as bytes."""
 
     @abstractmethod
-    def commit(self) -> Sequence[Path]:
-        """Give the finished files their names."""
+    def assemble(self, store: Store) -> list[Finished]:
+        """Complete files, on the disk, from the bytes of all slabs. May be called again after it was cut short."""
 
-    @abstractmethod
-    def abort(self) -> None:
-        """Remove whatever has been written and not committed. Safe to call at any time, more than once."""
+    def colors(self, rgb: FloatArray) -> FloatArray:
+        """sRGB-encoded colours in the colour space of this output."""
+        return from_srgb(rgb, self.output.colorspace)
 
-
-class FileWriter(Writer):
-    """A writer of a single file, under a temporary name in the same folder until it is whole."""
-
-    def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
-        super().__init__(output, volume, workers)
-        self.temporary = temporary_name(output.path)
-        self.file: BinaryIO = open(self.temporary, "wb")  # noqa: SIM115
-
-    def finish(self) -> None:
-        self.file.flush()
-        os.fsync(self.file.fileno())
-        self.file.close()
-
-    def commit(self) -> Sequence[Path]:
-        os.replace(self.temporary, self.output.path)
-        return [self.output.path]
-
-    def abort(self) -> None:
-        with suppress(OSError):  # closing flushes, which fails again on a full disk
-            self.file.close()
-        self.temporary.unlink(missing_ok=True)
+    def quantized(self, slab: FloatArray, z: int, dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
+        """The same as whole numbers, 0 .. 255 or 0 .. 65535 for [0, 1], dithered if the output asks for it."""
+        dither = bool(self.output.options.get("dither"))
+        return quantize(self.colors(slab), dtype, noise=triangular(slab.shape, z) if dither else None)
 
 
-def to_uint8(rgb: FloatArray) -> npt.NDArray[np.uint8]:
-    """[0, 1] to 0 .. 255, to the nearest."""
-    scaled: npt.NDArray[np.uint8] = (rgb.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-    return scaled
+class SequenceWriter(Writer):
+    """A single file: a header, what the slabs are encoded to, in order, and a trailer."""
+
+    def header(self, store: Store) -> bytes:
+        """Exactly `reserved` bytes."""
+        return b""
+
+    def trailer(self) -> bytes:
+        return b""
+
+    def assemble(self, store: Store) -> list[Finished]:
+        path = store.joined(DATA)
+        with open(path, "r+b") as file:
+            header = self.header(store)
+            assert len(header) == self.reserved
+            file.write(header)
+            file.seek(0, os.SEEK_END)
+            file.write(self.trailer())
+            file.flush()
+            os.fsync(file.fileno())
+        return [Finished(path, self.output.path)]
+
+
+DATA = "data"  # the stream that becomes a sequence writer's file
+
+
+def data(*parts: Bytes) -> Encoded:
+    """Bytes for the one stream of a sequence writer."""
+    return Encoded(streams={DATA: list(parts)})
+
+
+def replay(slabs: Iterable[tuple[int, FloatArray]], writer: Writer, folder: Path) -> list[Finished]:
+    """Feed a writer slabs that were not evaluated but read from a store. `folder` is made anew."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    store = Store(folder, writer.volume.shape[0], writer.reserved)
+    for z, slab in slabs:
+        store.append(z, len(slab), writer.encode(z, slab))
+    return writer.assemble(store)
+
+
+def spooled(
+    store: Store, stream: str, slice_shape: tuple[int, ...], dtype: npt.DTypeLike, slab: int
+) -> Iterator[tuple[int, npt.NDArray[np.generic]]]:
+    """A stream that holds the slices of an array one after the other, read back as slabs [<= slab, *slice_shape]."""
+    depth, size = store.depth, int(np.prod(slice_shape)) * np.dtype(dtype).itemsize
+    for z in range(0, depth, slab):
+        count = min(slab, depth - z)
+        yield z, np.frombuffer(store.read(stream, z, count, size), dtype).reshape(count, *slice_shape)

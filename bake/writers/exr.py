@@ -1,34 +1,44 @@
-"""`.exr`: a stack of half-float OpenEXR slices, one per z, linear Rec.709.
+"""`.exr`: a stack of OpenEXR slices, one per z, by default half-float and linear Rec.709.
 
-Row r of a file is y = r, its top row y = 0; column c is x = c; file number k (from `start`) is z = k - start. Written by the
-OpenEXR package: scanline, ZIP. It writes no time stamps, so equal plans give equal bytes. Attributes: `colorInteropID` and
-`chromaticities` say the encoding; `solidgrain:*` say which slice of which texture a file is.
+Row r of a file is y = r, its top row y = 0; column c is x = c; file number k (from `start`) is z = k - start. (Stacks along
+another axis are the same for a turned volume, see orient.py.) Written by the OpenEXR package, scanlines. It writes no time
+stamps, so equal plans give equal bytes. Attributes: `colorInteropID` and `chromaticities` say the encoding; `solidgrain:*`
+say which slice of which texture a file is.
 """
 
 from __future__ import annotations
 
+import io
 import json
-import os
-import shutil
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from solidgrain.bake.color import to_linear
+from solidgrain.bake.color import LINEAR, SRGB
 from solidgrain.bake.frames import frame_paths
-from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer
-from solidgrain.runtime.errors import BakeError
-from solidgrain.runtime.files import sync, temporary_name
+from solidgrain.bake.store import Bytes, Encoded, Finished, Store
+from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
+from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.workers import Workers
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # xy of red, green, blue, white (ITU-R BT.709)
+LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # ITU-R BT.709
+SOURCES = ("r", "g", "b", "luma", "one")
+TYPES = {"half": np.float16, "float": np.float32}
+COMPRESSIONS = ("none", "zip", "zips", "piz", "dwaa")
+OPTIONS = (
+    Option("type", "half", "of the channels", tuple(TYPES)),
+    Option("compression", "zip", "dwaa is lossy", COMPRESSIONS),
+    Option("channels", "R=r,G=g,B=b", "names, each with what it holds: r, g, b, luma or one, as in R=r,G=g,B=b,height=luma"),
+    Option("start", 1, "number of the first slice"),
+)
 
 
 class ExrStack(Writer):
-    """Slices gather in a hidden folder beside their destination until all of them are whole."""
+    """Each slice is a whole file as soon as it is encoded."""
 
     def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
         import OpenEXR
@@ -36,46 +46,48 @@ class ExrStack(Writer):
         super().__init__(output, volume, workers)
         OpenEXR.set_global_thread_count(0)  # one slice per thread of ours beats its own pool
         self.paths = files(output, volume)
-        self.staging = temporary_name(output.path)
-        self.staging.mkdir()
+        self.channels = parse_channels(output)
 
-    def write(self, z: int, slab: FloatArray) -> None:
-        self.workers.run([partial(self._write_slice, z + k, level) for k, level in enumerate(slab)])
-        for path in self.paths[z : z + len(slab)]:  # here, where waiting for the disk keeps no worker from evaluating
-            sync(self.staging / path.name)
+    def encode(self, z: int, slab: FloatArray) -> Encoded:
+        encoded: dict[str, Bytes] = {}
 
-    def _write_slice(self, z: int, rgb: FloatArray) -> None:
+        def encode_slice(k: int) -> None:
+            encoded[self.paths[z + k].name] = self._encode_slice(z + k, slab[k])
+
+        self.workers.run([partial(encode_slice, k) for k in range(len(slab))])
+        return Encoded(files=encoded)
+
+    def _encode_slice(self, z: int, rgb: FloatArray) -> bytes:
         import OpenEXR
 
-        pixels = to_linear(rgb).astype(np.float16)
-        path = self.staging / self.paths[z].name
-        try:
-            OpenEXR.File(slice_header(self.volume, z), {"RGB": np.ascontiguousarray(pixels)}).write(os.fspath(path))
-        except RuntimeError as error:
-            raise BakeError(f"{self.paths[z]}: cannot write ({error}); free space or bake elsewhere") from error
+        file = io.BytesIO()
+        OpenEXR.File(slice_header(self.output, self.volume, z), self._channels(self.colors(rgb))).write(file)
+        return file.getvalue()
 
-    def finish(self) -> None:
-        """Nothing: each slice is whole as soon as it is written."""
+    def _channels(self, rgb: FloatArray) -> dict[str, npt.NDArray[np.generic]]:
+        """What the file's channels hold, [y, x] each; plain RGB in one piece, which is faster."""
+        dtype = TYPES[str(self.output.options["type"])]
+        if list(self.channels.items()) == [("R", "r"), ("G", "g"), ("B", "b")]:
+            return {"RGB": np.ascontiguousarray(rgb, dtype)}
+        values = {"luma": rgb @ LUMA, "one": np.ones(rgb.shape[:2], dtype)}
+        values |= {source: rgb[..., k] for k, source in enumerate("rgb")}
+        return {name: np.ascontiguousarray(values[source], dtype) for name, source in self.channels.items()}
 
-    def commit(self) -> Sequence[Path]:
-        for path in self.paths:
-            os.replace(self.staging / path.name, path)
-        self.staging.rmdir()
-        return self.paths
-
-    def abort(self) -> None:
-        shutil.rmtree(self.staging, ignore_errors=True)
+    def assemble(self, store: Store) -> list[Finished]:
+        return [Finished(store.folder / path.name, path) for path in self.paths]
 
 
-def slice_header(volume: Volume, z: int) -> dict[str, Any]:
+def slice_header(output: Output, volume: Volume, z: int) -> dict[str, Any]:
     """The attributes of one slice."""
     import OpenEXR
 
+    column, row, along = (volume.axes[k : k + 2].lstrip("+") for k in (0, 2, 4))
     header: dict[str, Any] = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
+        "compression": getattr(
+            OpenEXR, {"none": "NO"}.get(name := str(output.options["compression"]), name.upper()) + "_COMPRESSION"
+        ),
         "type": OpenEXR.scanlineimage,
-        "chromaticities": REC709,
-        "colorInteropID": "lin_rec709_scene",
+        "colorInteropID": output.colorspace,
         "solidgrain:texture": volume.texture,
         "solidgrain:model": volume.sampler_sha256,
         "solidgrain:seed": str(volume.seed),  # may exceed an EXR int
@@ -84,17 +96,36 @@ def slice_header(volume: Volume, z: int) -> dict[str, Any]:
         "solidgrain:origin": np.array(volume.origin, np.float32),
         "solidgrain:spacing": np.array(volume.spacing, np.float32),
         "solidgrain:json": json.dumps({"origin": volume.origin, "spacing": volume.spacing}),  # unrounded
-        "solidgrain:axes": "column x, row y downwards from the top, slice z",
+        "solidgrain:axes": f"column {column}, row {row} downwards from the top, slice {along}",
     }
+    if output.colorspace in (LINEAR, SRGB):
+        header["chromaticities"] = REC709
     if volume.tile:
         wraps = ["periodic" if axis in volume.tile else "black" for axis in "xy"]
         header |= {"wrapmodes": ",".join(wraps), "solidgrain:tile": volume.tile}
     return header
 
 
+def parse_channels(output: Output) -> dict[str, str]:
+    """Channel names and their sources. Raises UsageError."""
+    text = str(output.options["channels"])
+    pairs = [part.partition("=") for part in text.split(",")]
+    channels = {name.strip(): source.strip() for name, _, source in pairs}
+    if len(channels) != len(pairs) or not all(channels) or not set(channels.values()) <= set(SOURCES):
+        raise UsageError(
+            f"--exr-channels {text}: expected NAME=SOURCE,... with each name once and sources from {', '.join(SOURCES)}"
+        )
+    return channels
+
+
+def check(output: Output, volume: Volume) -> None:
+    parse_channels(output)
+
+
 def files(output: Output, volume: Volume) -> list[Path]:
-    return frame_paths(output.path, volume.shape[0], int(output.options.get("start", 1)))
+    return frame_paths(output.path, volume.shape[0], int(output.options["start"]))
 
 
 def size(output: Output, volume: Volume) -> int:
-    return volume.voxels * 6 + volume.shape[0] * 4096
+    sample = np.dtype(TYPES[str(output.options["type"])]).itemsize
+    return volume.voxels * sample * len(parse_channels(output)) + volume.shape[0] * 4096

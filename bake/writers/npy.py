@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 
-from solidgrain.bake.writers.base import FileWriter, FloatArray, Output, Volume
-from solidgrain.runtime.workers import Workers
+from solidgrain.bake.store import Encoded, Store
+from solidgrain.bake.writers.base import FloatArray, Output, SequenceWriter, Volume, data
 
 
-class NpyFile(FileWriter):
+class NpyFile(SequenceWriter):
     """Header first, then the slabs as they come."""
 
-    def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
-        super().__init__(output, volume, workers)
-        header = {"descr": "<f4", "fortran_order": False, "shape": (*volume.shape, 3)}
-        np.lib.format.write_array_header_1_0(self.file, header)
+    @property
+    def reserved(self) -> int:
+        return len(_header(self.volume))
 
-    def write(self, z: int, slab: FloatArray) -> None:
-        self.file.write(np.ascontiguousarray(slab, "<f4").data)
+    def header(self, store: Store) -> bytes:
+        return _header(self.volume)
+
+    def encode(self, z: int, slab: FloatArray) -> Encoded:
+        return data(np.ascontiguousarray(self.colors(slab), "<f4").data)
+
+
+def _header(volume: Volume) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (*volume.shape, 3)})
+    return file.getvalue()
 
 
 def size(output: Output, volume: Volume) -> int:

@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer, to_uint8
+from solidgrain.bake.color import SRGB, quantize
+from solidgrain.bake.store import Encoded, Finished, Store
+from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer
 from solidgrain.runtime.errors import BakeError
-from solidgrain.runtime.files import sync, temporary_name
+from solidgrain.runtime.files import sync
 from solidgrain.runtime.workers import Workers
 
 PANEL = 384  # pixels along each side of a panel
@@ -37,59 +39,59 @@ class Plane:
 
 
 class PreviewFile(Writer):
-    """Collects six planes, draws when the last slab has come."""
+    """Keeps six planes of the volume, a stream for each, and draws when the last slab has come."""
 
     def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
         super().__init__(output, volume, workers)
         extents = volume.shape[::-1]
         self.steps = [-(-extent // FINEST) for extent in extents]
-        middles = [Plane(axis, extents[axis] // 2) for axis in (2, 1, 0)]
-        faces = [Plane(0, extents[0] - 1), Plane(1, 0), Plane(2, extents[2] - 1)]
-        self.middles, self.faces = middles, faces
-        self.parts: dict[Plane, list[FloatArray]] = {plane: [] for plane in [*middles, *faces]}
-        self.temporary = temporary_name(output.path)
+        self.middles = [Plane(axis, extents[axis] // 2) for axis in (2, 1, 0)]
+        self.faces = [Plane(0, extents[0] - 1), Plane(1, 0), Plane(2, extents[2] - 1)]
 
-    def write(self, z: int, slab: FloatArray) -> None:
+    def encode(self, z: int, slab: FloatArray) -> Encoded:
+        planes = {*self.middles, *self.faces}
+        return Encoded(
+            {f"axis{plane.axis}-{plane.index}": [np.ascontiguousarray(self._cut(plane, z, slab)).data] for plane in planes}
+        )
+
+    def _cut(self, plane: Plane, z: int, slab: FloatArray) -> FloatArray:
+        """The rows of a plane that lie in a slab: [z, x] or [z, y], or, across z, all of it or nothing."""
         thin_x, thin_y, thin_z = self.steps
-        levels = [level for level in range(z, z + len(slab)) if level % thin_z == 0]
-        thinned = slab[[level - z for level in levels]]
-        for plane, parts in self.parts.items():
-            if plane.axis == 2 and z <= plane.index < z + len(slab):
-                parts.append(slab[plane.index - z, ::thin_y, ::thin_x].copy())  # [y, x]
-            elif plane.axis == 1:
-                parts.append(thinned[:, plane.index, ::thin_x].copy())  # [z, x]
-            elif plane.axis == 0:
-                parts.append(thinned[:, ::thin_y, plane.index].copy())  # [z, y]
+        if plane.axis == 2:
+            return slab[plane.index - z, ::thin_y, ::thin_x] if z <= plane.index < z + len(slab) else slab[:0, :0]
+        thinned = slab[[k for k in range(len(slab)) if (z + k) % thin_z == 0]]
+        return thinned[:, plane.index, ::thin_x] if plane.axis == 1 else thinned[:, ::thin_y, plane.index]
 
-    def finish(self) -> None:
-        planes = {plane: np.concatenate(parts) for plane, parts in self.parts.items()}
+    def assemble(self, store: Store) -> list[Finished]:
+        planes = {plane: self._plane(plane, store) for plane in [*self.middles, *self.faces]}
         slices = [planes[plane] if plane.axis == 2 else planes[plane][::-1] for plane in self.middles]
         block = draw_block([planes[plane] for plane in self.faces], self.volume.shape[::-1])
         gap = np.full((PANEL, GAP, 3), BACKGROUND, np.float32)
         panels = [part for picture in [*map(fit, slices), block] for part in (picture, gap)][:-1]
-        self._write(to_uint8(np.concatenate(panels, axis=1)))
+        staged = store.folder / "preview.png"
+        self._write(staged, quantize(np.concatenate(panels, axis=1), np.uint8))
+        return [Finished(staged, self.output.path)]
 
-    def _write(self, picture: npt.NDArray[np.uint8]) -> None:
+    def _plane(self, plane: Plane, store: Store) -> FloatArray:
+        columns, rows, levels = (-(-extent // step) for extent, step in zip(self.volume.shape[::-1], self.steps, strict=True))
+        shape = [(levels, rows), (levels, columns), (rows, columns)][plane.axis]
+        path = store.joined(f"axis{plane.axis}-{plane.index}")
+        return np.fromfile(path, np.float32).reshape(*shape, 3)
+
+    def _write(self, path: Path, picture: npt.NDArray[np.generic]) -> None:
         """OpenImageIO reports success on a full disk: only reading the file back tells."""
         import OpenImageIO as oiio
 
         image = oiio.ImageBuf(np.ascontiguousarray(picture))
-        image.specmod().attribute("oiio:ColorSpace", "srgb_rec709_scene")
+        image.specmod().attribute("oiio:ColorSpace", SRGB)
         image.specmod().attribute("Software", "solidgrain")
         image.specmod().attribute("DateTime", "")  # no time stamp: equal volumes are equal bytes
-        written = image.write(os.fspath(self.temporary))
-        reader = oiio.ImageInput.open(os.fspath(self.temporary)) if written else None
+        written = image.write(os.fspath(path))
+        reader = oiio.ImageInput.open(os.fspath(path)) if written else None
         again = reader.read_image(oiio.UINT8) if reader else None
         if again is None or not np.array_equal(again, picture):
             raise BakeError(f"{self.output.path}: cannot write the preview; free space or bake elsewhere")
-        sync(self.temporary)
-
-    def commit(self) -> Sequence[Path]:
-        os.replace(self.temporary, self.output.path)
-        return [self.output.path]
-
-    def abort(self) -> None:
-        self.temporary.unlink(missing_ok=True)
+        sync(path)
 
 
 def fit(plane: FloatArray) -> FloatArray:

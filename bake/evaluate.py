@@ -1,0 +1,44 @@
+"""The colours of a plan: its texture on its grid, with as many samples per voxel as it asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from solidgrain.bake.color import to_linear, to_srgb
+from solidgrain.bake.plan import Plan
+from solidgrain.bake.writers import FloatArray
+from solidgrain.runtime import Texture
+
+
+def evaluate(plan: Plan, texture: Texture, first: int, stop: int) -> Iterator[tuple[int, FloatArray]]:
+    """Slices first .. stop - 1 as slabs, sRGB-encoded: pairs of first slice and [<= plan.slab, y, x, 3]."""
+    fine = round(plan.samples ** (1 / 3))  # samples along each axis
+    step = (plan.spacing[0] / fine, plan.spacing[1] / fine, plan.spacing[2] / fine)
+    shape = (fine * plan.size[2], fine * plan.size[1], fine * plan.size[0])
+    slabs = texture.slabs(
+        shape,
+        plan.seed,
+        origin=plan.origin,
+        spacing=step,
+        tile=plan.tile,
+        transform=plan.transform,
+        slab=fine * plan.slab,
+        slices=(fine * first, fine * stop),
+    )
+    return slabs if fine == 1 else ((z // fine, _averaged(slab, fine, texture)) for z, slab in slabs)
+
+
+def _averaged(slab: FloatArray, fine: int, texture: Texture) -> FloatArray:
+    """The mean of each voxel's fine³ samples, in linear light, as a sensor would take it."""
+    depth, height, width = (extent // fine for extent in slab.shape[:3])
+    mean = np.empty((depth, height, width, 3), np.float32)
+
+    def average(z: int) -> None:
+        samples = to_linear(slab[fine * z : fine * (z + 1)]).reshape(fine, height, fine, width, fine, 3)
+        mean[z] = to_srgb(samples.mean((0, 2, 4), dtype=np.float32))
+
+    texture.workers.run([partial(average, z) for z in range(depth)])
+    return mean

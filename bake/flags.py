@@ -1,0 +1,151 @@
+"""The flags of `solidgrain bake`, and the plan that they ask for."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from solidgrain.bake.arguments import (
+    parse_box,
+    parse_count,
+    parse_matrix,
+    parse_pixel_size,
+    parse_seed,
+    parse_shard,
+    parse_size,
+    parse_spacing,
+    parse_tile,
+    parse_vector,
+)
+from solidgrain.runtime.errors import UsageError
+
+if TYPE_CHECKING:
+    from solidgrain.bake.plan import Plan
+    from solidgrain.bake.writers import Output
+    from solidgrain.runtime import Texture
+
+ENGINES = ("unreal", "unity", "godot")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("source", nargs="?", metavar="SOURCE", help="embedded name, bundle or texture file (granite)")
+    _add_grid(parser.add_argument_group("the grid"))
+    _add_outputs(parser.add_argument_group("the files"))
+    _add_formats(parser.add_argument_group("settings of the formats"))
+    _add_work(parser.add_argument_group("the work"))
+    add("--dry-run", action="store_true", help="print the plan with bytes, memory and time, and stop")
+    add("--json", action="store_true", help="print one JSON object on stdout")
+    add("--quiet", action="store_true", help="no progress on stderr")
+
+
+def _add_grid(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--size", type=parse_size, metavar="N|XxYxZ", help="voxels, x by y by z (128)")
+    add("--seed", type=parse_seed, metavar="N", help="which instance of the texture (0)")
+    add("--origin", type=parse_vector, metavar="X,Y,Z", help="corner of the grid, exemplar pixels (0,0,0)")
+    add("--spacing", type=parse_spacing, metavar="S|X,Y,Z", help="exemplar pixels per voxel (1)")
+    add("--box", type=parse_box, metavar="X,Y,Z,X,Y,Z", help="both corners of the grid, instead of --origin and --spacing")
+    add("--pixel-size", type=parse_pixel_size, metavar="METRES", help="of an exemplar pixel; the lengths above are then metres")
+    add("--transform", type=parse_matrix, metavar="4x4", help="16 numbers, row by row: the grid's place in the texture")
+    add("--tile", type=parse_tile, metavar="AXES", help="axes that repeat seamlessly, any of xyz")
+    add("--samples", type=int, choices=(1, 8, 27), help="per voxel, averaged in linear light (1)")
+
+
+def _add_outputs(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--out", type=Path, action="append", default=[], metavar="FILE", help="granite.####.exr, .vti, .vdb, …; repeatable")
+    add("--preview", type=Path, metavar="FILE.png", help="a PNG with three slices and the turned block")
+
+
+def _add_formats(group: argparse._ArgumentGroup) -> None:
+    """A flag for each setting of each format in the table."""
+    from solidgrain.bake.writers import formats
+
+    rows = {row.name: row for row in formats().values()}
+    for row in rows.values():
+        for option in row.options:
+            flag, default = f"--{row.name}-{option.name}", f"{option.help} ({option.default})"
+            if option.choices:
+                group.add_argument(flag, choices=option.choices, help=default)
+            elif isinstance(option.default, int):
+                group.add_argument(flag, type=parse_count, metavar="N", help=default)
+            else:
+                group.add_argument(flag, metavar="TEXT", help=default)
+
+
+def _add_work(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--bundle", metavar="FOLDER", help="the bundle that a texture file belongs to")
+    add("--provider", default="auto", help="auto: the fused kernel, else ONNX Runtime; kernel, cpu, cuda, directml, … (auto)")
+    add("--precision", choices=("float32", "bfloat16"), help="bfloat16: faster, needs AMX (float32)")
+    add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
+    existing = group.add_mutually_exclusive_group()
+    existing.add_argument("--overwrite", action="store_true", help="replace outputs that exist")
+    existing.add_argument("--no-clobber", action="store_true", help="skip outputs that exist")
+    existing.add_argument("--resume", action="store_true", help="go on where a bake of the same plan was stopped")
+    existing.add_argument("--update", action="store_true", help="bake only what is not there, whole and of this plan")
+    add("--shard", type=parse_shard, metavar="I/N", help="bake share I of N; solidgrain merge completes the files")
+
+
+def make_plan(arguments: argparse.Namespace, texture: Texture) -> Plan:
+    """The plan that the flags ask for. Raises UsageError when they contradict each other."""
+    from solidgrain.bake.plan import Plan
+
+    size = arguments.size or (128, 128, 128)
+    origin, spacing = _placement(arguments, size)
+    return Plan(
+        source=arguments.source or "granite",
+        texture=texture.name,
+        texture_sha256=texture.data.sha256,
+        sampler_sha256=texture.data.sampler_sha256,
+        precision=texture.precision,
+        seed=arguments.seed or 0,
+        size=size,
+        origin=origin,
+        spacing=spacing,
+        tile=arguments.tile or "",
+        outputs=tuple(make_outputs(arguments)),
+        transform=arguments.transform,
+        samples=arguments.samples or 1,
+        bundle=arguments.bundle,
+    )
+
+
+def make_outputs(arguments: argparse.Namespace) -> list[Output]:
+    """The files that the flags name, with the settings of their formats."""
+    from solidgrain.bake.writers import PREVIEW, formats, kind_of, make_output
+
+    outputs = []
+    for path in arguments.out:
+        row = formats()[kind_of(path)]
+        flags = {option.name: getattr(arguments, f"{row.name}_{option.name}".replace("-", "_")) for option in row.options}
+        outputs.append(make_output(path, **{name: value for name, value in flags.items() if value is not None}))
+    if arguments.preview:
+        if arguments.preview.suffix.lower() != ".png":
+            raise UsageError(f"--preview {arguments.preview}: expected a name that ends in .png")
+        outputs.append(make_output(arguments.preview, PREVIEW))
+    return outputs
+
+
+def _placement(
+    arguments: argparse.Namespace, size: tuple[int, int, int]
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Origin and spacing (x, y, z) in exemplar pixels."""
+    scale = arguments.pixel_size or 1.0
+    if arguments.box is None:
+        origin, spacing = arguments.origin or (0.0, 0.0, 0.0), arguments.spacing
+        if spacing is None:
+            return _scaled(origin, scale), (1.0, 1.0, 1.0)
+        return _scaled(origin, scale), _scaled(spacing, scale)
+    if arguments.origin is not None or arguments.spacing is not None:
+        raise UsageError("--box: says where the grid is already; leave out --origin and --spacing")
+    low, high = arguments.box[:3], arguments.box[3:]
+    steps = [(stop - start) / count for start, stop, count in zip(low, high, size, strict=True)]
+    return _scaled(low, scale), _scaled(steps, scale)
+
+
+def _scaled(values: object, scale: float) -> tuple[float, float, float]:
+    x, y, z = (float(value) / scale for value in values)  # type: ignore[attr-defined]
+    return (x, y, z)

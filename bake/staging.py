@@ -1,0 +1,243 @@
+"""The store of a bake that may be killed: a hidden folder beside the output, with a lock, a journal and the plan it is for.
+
+    .granite.vti.baking/
+      lock               held while a process works here (flock: a dead owner does not hold it)
+      work.json          what the bytes depend on
+      journal.000000000  a line of JSON per slab: where its bytes are, and their SHA-256; one journal per shard
+      data.000000000     the slabs' bytes, one stream per shard; or whole files, one per slice
+      finished.json      the complete files, their checksums and destinations; written before the first is put in place
+
+Nothing is believed that its checksum does not confirm. What a kill has cut short is cut off or written again.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from solidgrain.bake.store import Encoded, Finished, Record, Span, Store, sha256_of
+from solidgrain.runtime.errors import BakeError
+from solidgrain.runtime.files import replacing
+
+LOCK, WORK, FINISHED, JOURNAL = "lock", "work.json", "finished.json", "journal"
+
+
+class Staging(Store):
+    """The store of one output. Opened with `open_staging`, closed with `close`; `clear` removes it."""
+
+    def __init__(self, folder: Path, depth: int, reserved: int, first: int, locks: list[BinaryIO]) -> None:
+        super().__init__(folder, depth, reserved, first)
+        self._locks = locks
+        self._journal = folder / f"{JOURNAL}.{first:09d}"
+
+    def append(self, z: int, slices: int, encoded: Encoded) -> Record:
+        record = super().append(z, slices, encoded)
+        with open(self._journal, "ab") as file:
+            file.write(_line(record))
+        return record
+
+    @property
+    def slices(self) -> int:
+        """How many slices are written."""
+        return sum(record.slices for record in self.records)
+
+    def restore(self) -> None:
+        """Take up what this shard's journal tells and its files confirm; forget the rest, on disk too."""
+        (self.folder / FINISHED).unlink(missing_ok=True)
+        self.records = self._confirmed(self._journal)
+        ends: dict[str, int] = {}
+        for record in self.records:
+            ends.update({span.file: span.offset + span.size for span in record.streams.values()})
+        for path in self.folder.glob(f"*.{self.first:09d}"):
+            if path != self._journal and path.name.partition(".")[0] != LOCK:
+                os.truncate(path, ends.get(path.name, 0))
+        with replacing(self._journal) as file:
+            file.writelines(_line(record) for record in self.records)
+
+    def gather(self) -> None:
+        """Take up what all shards' journals tell and their files confirm."""
+        journals = sorted(self.folder.glob(f"{JOURNAL}.*"))
+        self.records = [record for journal in journals for record in self._confirmed(journal)]
+
+    def _confirmed(self, journal: Path) -> list[Record]:
+        """A stream's records up to the first bad one: later bytes lie behind it. Files stand for themselves."""
+        found: list[Record] = []
+        ends: dict[str, int] = {}
+        for record in _records(journal):
+            follows = all(span.offset == ends.get(span.file, self._start(span.file)) for span in record.streams.values())
+            if not follows or not all(map(self.intact, [*record.streams.values(), *record.files.values()])):
+                if record.streams:
+                    break
+                continue
+            ends.update({span.file: span.offset + span.size for span in record.streams.values()})
+            found.append(record)
+        return found
+
+    def _start(self, stream_file: str) -> int:
+        return self.reserved if stream_file.endswith(f".{0:09d}") else 0
+
+    def finish(self, files: list[Finished]) -> list[dict[str, Any]]:
+        """Note that the files are complete: from here on, a killed bake has only to put them in place. Returns the notes."""
+        known = {span.file: span.sha256 for record in self.records for span in record.files.values()}
+        lines = [
+            {
+                "staged": file.staged.name,
+                "final": file.final.name,
+                "bytes": file.staged.stat().st_size,
+                "sha256": known.get(file.staged.name) or sha256_of(file.staged),
+            }
+            for file in files
+        ]
+        with replacing(self.folder / FINISHED) as file:
+            file.write(json.dumps(lines).encode())
+        return lines
+
+    def finished(self) -> list[dict[str, Any]] | None:
+        """The complete files, if `finish` came to its end and nothing has been lost since."""
+        try:
+            lines: list[dict[str, Any]] = json.loads((self.folder / FINISHED).read_bytes())
+        except (OSError, ValueError):
+            return None
+        return lines if all(self._found(line) for line in lines) else None
+
+    def _found(self, line: dict[str, Any]) -> bool:
+        """Whether a complete file lies here, or already where it belongs."""
+        for path in (self.folder / line["staged"], self.folder.parent / line["final"]):
+            if path.is_file():
+                return sha256_of(path) == str(line["sha256"])
+        return False
+
+    def commit(self, lines: list[dict[str, Any]]) -> list[Path]:
+        """Put the complete files in place."""
+        finals = []
+        for line in lines:
+            final = self.folder.parent / line["final"]
+            with suppress(FileNotFoundError):  # put in place before a kill
+                os.replace(self.folder / line["staged"], final)
+            finals.append(final)
+        return finals
+
+    def close(self) -> None:
+        """Let others work here."""
+        for lock in self._locks:
+            lock.close()
+
+    def clear(self) -> None:
+        """Remove the folder, the lock last: whoever waits for it finds a folder that is gone, and begins a new one."""
+        for path in sorted(self.folder.glob("*"), key=lambda path: path.name.startswith(LOCK)):
+            if path.is_dir():
+                Store(path, 0).clear()
+            else:
+                path.unlink(missing_ok=True)
+        with suppress(OSError):
+            self.folder.rmdir()
+
+
+def staging_folder(output: Path) -> Path:
+    return output.with_name(f".{output.name}.baking")
+
+
+def is_begun(output: Path) -> bool:
+    """Whether an earlier bake of an output was killed while it put its files in place."""
+    return (staging_folder(output) / FINISHED).exists()
+
+
+def open_staging(
+    output: Path, work: dict[str, Any], depth: int, reserved: int, shard: tuple[int, int] | None, fresh: bool
+) -> Staging:
+    """The staging of an output, locked: for one shard (slices first .. stop - 1), or, with None, for all of it.
+
+    `fresh` forgets what an earlier bake has left. Raises BakeError if another process works there, or if what it left
+    belongs to another plan.
+    """
+    folder = staging_folder(output)
+    locks = _lock(folder, output, shard)
+    staging = Staging(folder, depth, reserved, shard[0] if shard else 0, locks)
+    try:
+        if fresh and shard is None:
+            for path in folder.iterdir():
+                if path.name != LOCK:
+                    Store(path, 0).clear() if path.is_dir() else path.unlink()
+        _check_work(folder / WORK, output, work)
+    except BaseException:
+        staging.close()
+        raise
+    return staging
+
+
+def _lock(folder: Path, output: Path, shard: tuple[int, int] | None) -> list[BinaryIO]:
+    """All of the staging, or a share in it and the shard's own part."""
+    if shard is None:
+        return [_locked(folder, LOCK, output, fcntl.LOCK_EX)]
+    whole = _locked(folder, LOCK, output, fcntl.LOCK_SH)
+    try:
+        return [whole, _locked(folder, f"{LOCK}.{shard[0]:09d}", output, fcntl.LOCK_EX)]
+    except BaseException:
+        whole.close()
+        raise
+
+
+def _locked(folder: Path, name: str, output: Path, kind: int) -> BinaryIO:
+    while True:
+        folder.mkdir(exist_ok=True)
+        try:
+            file = open(folder / name, "a+b")  # noqa: SIM115
+        except FileNotFoundError:
+            continue  # its last owner has removed the folder just now
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            if os.fstat(file.fileno()).st_ino == (folder / name).stat().st_ino:
+                return file
+        except BlockingIOError:
+            file.close()
+            raise BakeError(f"{output}: another process is baking it; wait for it, or write to another name") from None
+        except FileNotFoundError:
+            pass
+        file.close()
+
+
+def _check_work(path: Path, output: Path, work: dict[str, Any]) -> None:
+    """The staging must be for this work. A new one is given its name."""
+    content = json.dumps(work, sort_keys=True, indent=1).encode()
+    if not path.exists():
+        with replacing(path) as file:
+            file.write(content)
+    found = read_work(path)
+    if found != json.loads(content):
+        differ = sorted(key for key in {*found, *work} if found.get(key) != json.loads(content).get(key))
+        raise BakeError(
+            f"{output}: an unfinished bake of another plan lies in {path.parent} (different: {', '.join(differ)}); "
+            "finish it with its own flags, or begin anew with --overwrite"
+        )
+
+
+def read_work(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        found = None
+    return found if isinstance(found, dict) else {"work": "unreadable"}
+
+
+def _line(record: Record) -> bytes:
+    values = {"z": record.z, "slices": record.slices, "streams": dict(record.streams), "files": dict(record.files)}
+    return json.dumps(values).encode() + b"\n"
+
+
+def _records(journal: Path) -> list[Record]:
+    """The lines of a journal that are whole."""
+    try:
+        lines = journal.read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return []
+    records = []
+    for line in lines[:-1]:
+        with suppress(ValueError, TypeError, KeyError):
+            values = json.loads(line)
+            spans = [{name: Span(*span) for name, span in values[kind].items()} for kind in ("streams", "files")]
+            records.append(Record(int(values["z"]), int(values["slices"]), *spans))
+    return records
