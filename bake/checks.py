@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from solidgrain.bake.plan import Plan, format_bytes, format_size
-from solidgrain.bake.writers import Output, check_output, output_bytes, output_exists, output_files
+from solidgrain.bake.staging import staged_bytes
+from solidgrain.bake.writers import Output, check_output, output_bytes, output_exists, output_files, scratch_bytes
 from solidgrain.runtime.errors import BakeError, UsageError
 
 
@@ -64,17 +65,18 @@ def _check_memory(plan: Plan) -> None:
 
 
 def _check_disk(plan: Plan) -> None:
-    """The outputs' sizes per file system against its free space."""
+    """The outputs' sizes per file system against its free space, less what an earlier bake has left there."""
     needed: dict[int, tuple[Path, int]] = {}
     for output in plan.outputs:
-        device = output.path.parent.stat().st_dev
-        total = needed.get(device, (output.path.parent, 0))[1] + output_bytes(output, plan.volume)
-        needed[device] = (output.path.parent, total)
+        folder = output.path.parent
+        device = folder.stat().st_dev
+        size = output_bytes(output, plan.volume) + scratch_bytes(output, plan.volume) - staged_bytes(output.path)
+        needed[device] = (folder, needed.get(device, (folder, 0))[1] + max(0, size))
     for folder, size in needed.values():
         free = shutil.disk_usage(folder).free
         if size > free:
             raise BakeError(
-                f"--size {format_size(plan.size)}: the outputs need up to {format_bytes(size)} in {folder.resolve()}, "
+                f"--size {format_size(plan.size)}: the bake needs up to {format_bytes(size)} in {folder.resolve()}, "
                 f"{format_bytes(free)} are free; bake less or elsewhere"
             )
 

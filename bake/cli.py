@@ -19,6 +19,8 @@ from typing import NoReturn
 
 COMMANDS = {
     "bake": ("solidgrain.bake.commands.bake", "evaluate a texture on a voxel grid and write it to files"),
+    "merge": ("solidgrain.bake.commands.merge", "complete the files of a plan whose shards have all been baked"),
+    "verify": ("solidgrain.bake.commands.verify", "check baked files: checksums, and random voxels evaluated again"),
     "view": ("solidgrain.bake.commands.view", "look at a volume with pyvista, on screen or to a PNG"),
     "info": ("solidgrain.bake.commands.info", "say what a texture or bundle is, and check it"),
     "doctor": ("solidgrain.bake.commands.doctor", "say what this installation can do, and what is wrong with it"),
@@ -32,7 +34,10 @@ EXTRAS = {
     "spox": "export",
     "OpenEXR": "bake",
     "OpenImageIO": "bake",
+    "jsonschema": "bake",
+    "distributed": "dask",
     "stlpips_pytorch": "evaluate",
+    "etcpak": "dds",
     "pyvista": "view",
     "vtkmodules": "view",
 }
@@ -78,7 +83,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _fail(f"cannot print the result ({error.strerror})")
         raise
     except KeyboardInterrupt:
-        print("interrupted; nothing half-written was left behind", file=sys.stderr)
+        left = "go on with the same flags" if keeps_work(options) else "nothing half-written was left behind"
+        print(f"interrupted; {left}", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -105,6 +111,11 @@ def _glue_negative(arguments: list[str]) -> list[str]:
         else:
             glued.append(word)
     return glued
+
+
+def keeps_work(options: argparse.Namespace) -> bool:
+    """Whether an interrupt leaves what was done for the next run to take up."""
+    return any(getattr(options, name, None) for name in ("resume", "shard", "dask"))
 
 
 def _fail(message: str) -> int:

@@ -11,6 +11,7 @@ from solidgrain.bake.arguments import (
     parse_count,
     parse_matrix,
     parse_pixel_size,
+    parse_positive,
     parse_seed,
     parse_shard,
     parse_size,
@@ -18,6 +19,7 @@ from solidgrain.bake.arguments import (
     parse_tile,
     parse_vector,
 )
+from solidgrain.bake.distributed import parse_cluster
 from solidgrain.runtime.errors import UsageError
 
 if TYPE_CHECKING:
@@ -57,6 +59,11 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
     add("--out", type=Path, action="append", default=[], metavar="FILE", help="granite.####.exr, .vti, .vdb, …; repeatable")
     add("--preview", type=Path, metavar="FILE.png", help="a PNG with three slices and the turned block")
+    add("--colorspace", metavar="NAME", help="of the --out files, from $OCIO or the built-in configuration (each format's own)")
+    add("--dither", action="store_true", help="triangular dither before rounding to whole numbers, a function of the voxel")
+    add("--mips", action="store_true", help="write the mip chain too, filtered in linear light")
+    add("--mip-filter", choices=("box", "kaiser"), help="kaiser is sharper (box)")
+    add("--for", dest="engine", choices=ENGINES, help="axis order, layout and limits of a game engine")
 
 
 def _add_formats(group: argparse._ArgumentGroup) -> None:
@@ -87,6 +94,14 @@ def _add_work(group: argparse._ArgumentGroup) -> None:
     existing.add_argument("--resume", action="store_true", help="go on where a bake of the same plan was stopped")
     existing.add_argument("--update", action="store_true", help="bake only what is not there, whole and of this plan")
     add("--shard", type=parse_shard, metavar="I/N", help="bake share I of N; solidgrain merge completes the files")
+    add("--plan", type=Path, metavar="FILE", help="bake a plan that was saved: a .bake.json, or what --dry-run --json printed")
+    add("--jobs", type=Path, metavar="FILE", help="bake all that a job file lists, .json or .toml")
+    add("--continue-on-error", action="store_true", help="go on with the next job of --jobs when one fails")
+    add(
+        "--dask", type=parse_cluster, metavar="local:N|ADDRESS", help="bake on N local processes, or a Dask scheduler's workers"
+    )
+    add("--emit-openjd", type=Path, metavar="FOLDER", help="write a render-farm job (Open Job Description) instead of baking")
+    add("--shards", type=parse_positive, metavar="N", help="of --dask and --emit-openjd (one per slab, at most 64)")
 
 
 def make_plan(arguments: argparse.Namespace, texture: Texture) -> Plan:
@@ -119,14 +134,32 @@ def make_outputs(arguments: argparse.Namespace) -> list[Output]:
 
     outputs = []
     for path in arguments.out:
-        row = formats()[kind_of(path)]
+        kind = kind_of(path)
+        row = formats()[kind]
         flags = {option.name: getattr(arguments, f"{row.name}_{option.name}".replace("-", "_")) for option in row.options}
-        outputs.append(make_output(path, **{name: value for name, value in flags.items() if value is not None}))
+        given = {name: value for name, value in flags.items() if value is not None}
+        outputs.append(make_output(path, kind, **_shared_options(arguments, kind), **given))
     if arguments.preview:
         if arguments.preview.suffix.lower() != ".png":
             raise UsageError(f"--preview {arguments.preview}: expected a name that ends in .png")
         outputs.append(make_output(arguments.preview, PREVIEW))
     return outputs
+
+
+def _shared_options(arguments: argparse.Namespace, kind: str) -> dict[str, str | int]:
+    """The options that outputs of every kind have."""
+    if arguments.mip_filter and not arguments.mips:
+        raise UsageError("--mip-filter: there are no levels to filter; add --mips")
+    options: dict[str, str | int] = {"mips": (arguments.mip_filter or "box") if arguments.mips else ""}
+    if arguments.colorspace is not None:
+        options["colorspace"] = arguments.colorspace
+    if arguments.dither:
+        options["dither"] = 1
+    if arguments.engine:
+        from solidgrain.bake.engines import axes_for
+
+        options |= {"engine": arguments.engine, "axes": axes_for(arguments.engine, kind)}
+    return options
 
 
 def _placement(

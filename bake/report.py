@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from solidgrain.runtime import Texture
 def describe(plan: Plan, texture: Texture) -> dict[str, Any]:
     """What a bake would take: bytes per output, memory, and seconds from a short run of the sampler."""
     rate = measure_rate(texture, plan.seed) / plan.samples
-    tiling = texture.tiling(plan.volume.shape, spacing=plan.spacing, tile=plan.tile, transform=plan.transform)
     return {
         "plan": plan.to_json(),
         "voxels": plan.volume.voxels,
@@ -28,7 +28,7 @@ def describe(plan: Plan, texture: Texture) -> dict[str, Any]:
         "provider": texture.provider,
         "provider_note": texture.provider_note,
         "threads": texture.threads,
-        "tile_distortion": [round(float(value), 4) for value in tiling.distortion] if plan.tile else None,
+        "tile_distortion": tile_distortion(plan, texture),
     }
 
 
@@ -54,18 +54,33 @@ def summary(report: dict[str, Any]) -> str:
         f"time      about {report['seconds']:.3g} s on {report['threads']} threads, {report['provider']}",
     ]
     if report["tile_distortion"]:
-        least, most = min(report["tile_distortion"]), max(report["tile_distortion"])
-        lines.append(f"tiling    {plan['tile']}; octaves move by {least:.1%} to {most:.1%}")
+        lines.append(f"tiling    {tiling_line(plan['tile'], report['tile_distortion'])}")
     return "\n".join(lines)
 
 
-def result(plan: Plan, provider: str, baked: Baked) -> dict[str, Any]:
+def tile_distortion(plan: Plan, texture: Texture) -> list[float] | None:
+    """By how much tiling moved each octave, relative to its transform; None without tiling."""
+    tiling = texture.tiling(
+        [extent * round(plan.samples ** (1 / 3)) for extent in plan.volume.shape],
+        spacing=[step / round(plan.samples ** (1 / 3)) for step in plan.spacing],
+        tile=plan.tile,
+        transform=plan.transform,
+    )
+    return [round(float(value), 4) for value in tiling.distortion] if plan.tile else None
+
+
+def tiling_line(tile: str, distortion: Sequence[float]) -> str:
+    return f"{tile}; octaves move by {min(distortion):.1%} to {max(distortion):.1%}"
+
+
+def result(plan: Plan, texture: Texture, baked: Baked) -> dict[str, Any]:
     """What `--json` prints after a bake."""
     return {
         "plan": plan.to_json(),
         "files": [str(path) for path in baked.files],
         "color_encoding": {str(output.path): output.colorspace for output in plan.outputs},
-        "provider": provider,
+        "provider": texture.provider,
+        "tile_distortion": tile_distortion(plan, texture),
         "seconds": round(baked.seconds, 3),
         "evaluation_seconds": round(baked.evaluation_seconds, 3),
         "voxels_per_second": round(plan.volume.voxels / baked.seconds) if baked.seconds else None,
@@ -106,9 +121,11 @@ class Progress:
         if self.terminal and not self.quiet:
             sys.stderr.write("\n")
 
-    def finish(self, plan: Plan, baked: Baked, slices: int) -> None:
+    def finish(self, plan: Plan, texture: Texture, baked: Baked, slices: int) -> None:
         if self.quiet:
             return
         rate = plan.volume.voxels * (slices - baked.reused_slices) / plan.size[2] / baked.seconds / 1e6
         reused = f", {baked.reused_slices} slices were there" if baked.reused_slices else ""
         sys.stderr.write(f"{plan.texture}: {len(baked.files)} files in {baked.seconds:.1f} s, {rate:.2f} Mvoxel/s{reused}\n")
+        if distortion := tile_distortion(plan, texture):
+            sys.stderr.write(f"tiles along {tiling_line(plan.tile, distortion)}\n")

@@ -15,7 +15,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -69,7 +69,8 @@ class Staging(Store):
         ends: dict[str, int] = {}
         for record in _records(journal):
             follows = all(span.offset == ends.get(span.file, self._start(span.file)) for span in record.streams.values())
-            if not follows or not all(map(self.intact, [*record.streams.values(), *record.files.values()])):
+            whole = all(self.intact(span, alone=True) for span in record.files.values())
+            if not (follows and whole and all(map(self.intact, record.streams.values()))):
                 if record.streams:
                     break
                 continue
@@ -85,10 +86,10 @@ class Staging(Store):
         known = {span.file: span.sha256 for record in self.records for span in record.files.values()}
         lines = [
             {
-                "staged": file.staged.name,
+                "staged": os.fspath(file.staged.relative_to(self.folder)),
                 "final": file.final.name,
                 "bytes": file.staged.stat().st_size,
-                "sha256": known.get(file.staged.name) or sha256_of(file.staged),
+                "sha256": known.get(os.fspath(file.staged.relative_to(self.folder))) or sha256_of(file.staged),
             }
             for file in files
         ]
@@ -144,6 +145,19 @@ def staging_folder(output: Path) -> Path:
 def is_begun(output: Path) -> bool:
     """Whether an earlier bake of an output was killed while it put its files in place."""
     return (staging_folder(output) / FINISHED).exists()
+
+
+def staged_bytes(output: Path) -> int:
+    """The bytes that an earlier bake has left in the staging of an output."""
+    return sum(path.stat().st_size for path in staging_folder(output).glob("*") if path.is_file())
+
+
+def discard_staging(output: Path) -> None:
+    """Remove what a kill has left of a bake whose files are all in place, unless another process works there."""
+    folder = staging_folder(output)
+    if folder.is_dir():
+        with suppress(BakeError), closing(Staging(folder, 0, 0, 0, _lock(folder, output, None))) as staging:
+            staging.clear()
 
 
 def open_staging(

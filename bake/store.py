@@ -132,10 +132,21 @@ class Store:
             raise EOFError(f"{self.folder}: stream {stream} is cut short")
         return content
 
-    def intact(self, span: Span) -> bool:
-        """Whether the bytes of a span are what was written."""
+    def read_span(self, span: Span, offset: int, size: int) -> bytes:
+        """Some bytes of a span."""
+        with open(self.folder / span.file, "rb") as file:
+            file.seek(span.offset + offset)
+            content = file.read(size)
+        if len(content) != size:
+            raise EOFError(f"{self.folder / span.file}: cut short")
+        return content
+
+    def intact(self, span: Span, alone: bool = False) -> bool:
+        """Whether the bytes of a span are what was written, and, if it is `alone`, all that its file holds."""
         digest = hashlib.sha256()
         try:
+            if alone and (self.folder / span.file).stat().st_size != span.size:
+                return False
             for content in self._pieces(span):
                 digest.update(content)
         except OSError:

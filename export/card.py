@@ -21,7 +21,7 @@ def write_card(name: str, training: dict[str, Any]) -> str:
     ]
     exemplars = [
         f"- `{entry['exemplar']}`, licence: {entry['license'] or 'not stated'}, credit: {entry['credit'] or 'not stated'}\n"
-        f"  (sha256 of its pixels `{entry['sha256'][:16]}…`)"
+        f"  (read as {entry.get('colorspace') or 'not stated'}, sha256 of its pixels `{entry['sha256'][:16]}…`)"
         for entry in training["exemplars"]
     ]
     lines = [f"# {name}", "", "A solid texture trained on:", "", *exemplars, "", "| | |", "|---|---|"]

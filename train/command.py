@@ -74,13 +74,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 def start(arguments: argparse.Namespace) -> Run:
     """A new run directory for the photograph, with a warning if one texture cannot describe it."""
-    from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity, read_exemplar
+    from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity, read_photograph
     from solidgrain.train.run import Source, create_run
 
     if arguments.exemplar is None:
         raise UsageError("no EXEMPLAR given; expected a photograph to learn from")
     settings = make_settings(arguments)
-    exemplar = read_exemplar(arguments.exemplar, settings.patch)
+    exemplar, colorspace, warning = read_photograph(arguments.exemplar, settings.patch)
+    if warning:
+        print(f"warning: {arguments.exemplar}: {warning}", file=sys.stderr)
     if (found := nonstationarity(exemplar)) > NONSTATIONARY:
         print(
             f"warning: {arguments.exemplar} changes across itself (nonstationarity {found:.2f}, above {NONSTATIONARY}); "
@@ -88,7 +90,7 @@ def start(arguments: argparse.Namespace) -> Run:
             file=sys.stderr,
         )
     settings = with_grain(settings, arguments.anisotropic, exemplar)
-    source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "")
+    source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace)
     return create_run(arguments.out, settings, exemplar, source, make_budget(arguments, settings.preset))
 
 

@@ -23,14 +23,29 @@ LARGEST = 64 * 2**20  # pixels; 768 MB as float32 RGB, far more than one texture
 NONSTATIONARY = 0.3  # above it, one texture cannot describe the image (docs/training.md)
 
 
+class Photograph(NamedTuple):
+    """What was read of a file."""
+
+    pixels: FloatArray  # sRGB-encoded, [H, W, 3] in [0, 1]
+    colorspace: str  # what the file's colours were read as
+    warning: str  # what the file declares of its colours that could not be honoured, or ""
+
+
 def read_exemplar(path: str | os.PathLike[str], smallest: int) -> FloatArray:
+    """The pixels of `read_photograph`."""
+    return read_photograph(path, smallest).pixels
+
+
+def read_photograph(path: str | os.PathLike[str], smallest: int) -> Photograph:
     """A photograph as sRGB-encoded RGB, [H, W, 3] float32 in [0, 1].
 
     Anything that OpenImageIO reads: 8 and 16 bit, float, grey (repeated), alpha (dropped), CMYK (converted by its reader).
-    Linear files (EXR, HDR) are encoded to sRGB and clipped. Raises ExemplarError when the file is missing, unreadable,
-    incomplete, smaller than `smallest` pixels along an axis or larger than `LARGEST` pixels.
+    Colours of another space that the file declares (encoding.py) are converted to sRGB and clipped. Raises ExemplarError when
+    the file is missing, unreadable, incomplete, smaller than `smallest` pixels along an axis or larger than `LARGEST` pixels.
     """
     import OpenImageIO as oiio
+
+    from solidgrain.train.encoding import encode
 
     path = Path(path)
     if not path.is_file():
@@ -54,9 +69,9 @@ def read_exemplar(path: str | os.PathLike[str], smallest: int) -> FloatArray:
     rgb = np.asarray(pixels, np.float32)[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
     if not np.isfinite(rgb).all():
         raise ExemplarError(f"{path}: holds NaN or infinite pixels; expected finite colours")
-    if spec.format.basetype in (oiio.HALF, oiio.FLOAT):
-        rgb = _encode(np.ascontiguousarray(rgb), spec.get_string_attribute("oiio:ColorSpace"))
-    return np.ascontiguousarray(rgb.clip(0.0, 1.0), np.float32)
+    encoded = encode(rgb, spec)
+    pixels = np.ascontiguousarray(encoded.rgb.clip(0.0, 1.0), np.float32)
+    return Photograph(pixels, encoded.colorspace, encoded.warning)
 
 
 def _check_size(path: Path, spec: oiio.ImageSpec, smallest: int) -> None:
@@ -68,16 +83,6 @@ def _check_size(path: Path, spec: oiio.ImageSpec, smallest: int) -> None:
         )
     if width * height > LARGEST:
         raise ExemplarError(f"{path}: {width}x{height} pixels, expected at most {LARGEST >> 20} megapixels; crop or resize it")
-
-
-def _encode(rgb: FloatArray, color_space: str) -> FloatArray:
-    """Float files (EXR, HDR) are linear Rec.709 unless they say otherwise; the sampler learns sRGB-encoded colour."""
-    import OpenImageIO as oiio
-
-    converted = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(rgb), color_space or "lin_rec709_scene", "srgb_rec709_scene")
-    if converted.has_error:
-        raise ExemplarError(f"colour space {color_space!r}: {_first_line(converted.geterror())}")
-    return np.asarray(converted.get_pixels(oiio.FLOAT), np.float32)
 
 
 def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:

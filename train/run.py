@@ -41,6 +41,7 @@ class Source:
     exemplar: str  # file name
     license: str
     credit: str
+    colorspace: str = ""  # what its colours were read as, "" in runs that do not say
 
 
 @dataclass(frozen=True)

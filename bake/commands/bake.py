@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from solidgrain.bake.flags import add_arguments, make_plan
+from solidgrain.bake.modes import check_modes
 from solidgrain.runtime.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,8 +22,10 @@ __all__ = ["add_arguments", "run"]
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.report import describe, summary
 
-    texture = load_texture(arguments)
-    plan = make_plan(arguments, texture)
+    check_modes(arguments)
+    if arguments.jobs:
+        return run_jobs(arguments)
+    plan, texture = planned(arguments)
     if not plan.outputs and not arguments.dry_run:
         raise UsageError("nothing to write: give at least one --out FILE or --preview FILE.png")
     plan = to_do(plan, arguments)
@@ -29,10 +33,58 @@ def run(arguments: argparse.Namespace) -> int:
         report = describe(plan, texture)
         print(json.dumps(report, indent=2) if arguments.json else summary(report))
         return 0
-    report = bake_plan(plan, texture, arguments) if plan.outputs else {**describe(plan, texture), "files": []}
+    if not plan.outputs:
+        report = {**describe(plan, texture), "files": []}
+    else:
+        report = emit_job(plan, arguments) if arguments.emit_openjd else bake_plan(plan, texture, arguments)
     if arguments.json:
         print(json.dumps(report, indent=2))
     return 0
+
+
+def planned(arguments: argparse.Namespace) -> tuple[Plan, Texture]:
+    """The plan that the flags ask for, or the one that --plan names, and its texture."""
+    if arguments.plan is None:
+        texture = load_texture(arguments)
+        return make_plan(arguments, texture), texture
+    from solidgrain.bake.schema import load_plan
+    from solidgrain.bake.verify import check_texture
+
+    plan = load_plan(arguments.plan)
+    plan = replace(plan, source=arguments.source or plan.source, bundle=arguments.bundle or plan.bundle)
+    of_plan = {"source": plan.source, "bundle": plan.bundle, "precision": plan.precision}
+    texture = load_texture(argparse.Namespace(**{**vars(arguments), **of_plan}))
+    check_texture(plan, texture, f"--plan {arguments.plan}")
+    return plan, texture
+
+
+def run_jobs(arguments: argparse.Namespace) -> int:
+    """Bake, or plan, every job of a job file. Exit code 1 if one failed."""
+    from solidgrain.bake.jobs import FAILED, bake_jobs, plan_jobs, read_jobs
+    from solidgrain.bake.report import describe, summary
+
+    jobs, textures = plan_jobs(read_jobs(arguments.jobs, arguments), load_texture, to_do)
+    if arguments.dry_run:
+        plans = [{"name": one.job.name, **describe(one.plan, textures[one.job.texture])} for one in jobs]
+        print(json.dumps({"jobs": plans}, indent=2) if arguments.json else "\n\n".join(map(summary, plans)))
+        return 0
+    report = bake_jobs(jobs, textures, bake_plan, tell_error, arguments.continue_on_error)
+    if arguments.json:
+        print(json.dumps({"jobs": report}, indent=2))
+    return 1 if any(job["status"] == FAILED for job in report) else 0
+
+
+def tell_error(message: str) -> None:
+    print(f"solidgrain: {message}", file=sys.stderr)
+
+
+def emit_job(plan: Plan, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Write the plan as a job for a render farm."""
+    from solidgrain.bake.openjd import emit
+
+    overwrite = arguments.overwrite or arguments.update
+    files = emit(plan, arguments.emit_openjd, arguments.shards, overwrite, arguments.provider, arguments.threads)
+    return {"plan": plan.to_json(), "files": [str(path) for path in files]}
 
 
 def load_texture(arguments: argparse.Namespace) -> Texture:
@@ -51,28 +103,38 @@ def to_do(plan: Plan, arguments: argparse.Namespace) -> Plan:
     """The plan without what is done already or must stay, once nothing speaks against it."""
     from solidgrain.bake.checks import check_plan, without_existing
     from solidgrain.bake.manifest import is_complete
-    from solidgrain.bake.staging import is_begun
+    from solidgrain.bake.staging import discard_staging, is_begun
 
     if arguments.no_clobber:
         plan = without_existing(plan)
-    if arguments.resume or arguments.update or arguments.shard:
-        plan = replace(plan, outputs=tuple(output for output in plan.outputs if not is_complete(plan, output)))
+    if arguments.resume or arguments.update or arguments.shard or arguments.dask:
+        complete = {output.path for output in plan.outputs if is_complete(plan, output)}
+        for path in complete:
+            discard_staging(path)
+        plan = replace(plan, outputs=tuple(output for output in plan.outputs if output.path not in complete))
     begun = [output for output in plan.outputs if is_begun(output.path)] if arguments.resume or arguments.shard else []
     check_plan(plan, arguments.overwrite or arguments.update, begun)
     return plan
 
 
 def bake_plan(plan: Plan, texture: Texture, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Bake, or a share of it, and say so."""
+    """Bake, or a share of it, here or on a cluster, and say so."""
     from solidgrain.bake.baker import bake
+    from solidgrain.bake.distributed import bake_on_cluster
     from solidgrain.bake.report import Progress, result
 
     progress = Progress(arguments.quiet)
-    shard = plan.shard(*arguments.shard) if arguments.shard else None
+    shard, details = plan.shard(*arguments.shard) if arguments.shard else None, {}
     try:
-        baked = bake(plan, texture, progress.show, resume=arguments.resume, shard=shard)
+        if arguments.dask:
+            anew = arguments.overwrite or arguments.update
+            options = {"overwrite": anew, "provider": arguments.provider, "threads": arguments.threads}
+            baked, told = bake_on_cluster(plan, texture, arguments.dask, arguments.shards, progress.show, **options)
+            details = {"shards": told}
+        else:
+            baked = bake(plan, texture, progress.show, resume=arguments.resume, shard=shard)
     finally:
         progress.end_line()
     first, stop = shard or (0, plan.size[2])
-    progress.finish(plan, baked, stop - first)
-    return result(plan, texture.provider, baked)
+    progress.finish(plan, texture, baked, stop - first)
+    return {**result(plan, texture, baked), **details}

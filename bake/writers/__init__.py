@@ -11,6 +11,7 @@ from solidgrain.bake.writers.table import (
     output_bytes,
     output_exists,
     output_files,
+    scratch_bytes,
     suffixes,
 )
 
@@ -30,5 +31,6 @@ __all__ = [
     "output_exists",
     "output_files",
     "replay",
+    "scratch_bytes",
     "suffixes",
 ]

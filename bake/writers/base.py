@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -90,13 +90,27 @@ class Writer(ABC):
     def assemble(self, store: Store) -> list[Finished]:
         """Complete files, on the disk, from the bytes of all slabs. May be called again after it was cut short."""
 
+    def assemble_levels(self, store: Store, levels: Sequence[Store]) -> list[Finished]:
+        """The same for a format whose file holds the mip levels too (`Format.levels_inside`)."""
+        raise NotImplementedError
+
+    def probe(self, voxels: npt.NDArray[np.int64]) -> tuple[FloatArray, float] | None:
+        """The colours [P, 3] that the finished files hold at voxels [P, 3] (x, y, z), in the output's colour space, and how
+        far the format's rounding may move them. None for a format whose error has no bound."""
+        return None
+
     def colors(self, rgb: FloatArray) -> FloatArray:
         """sRGB-encoded colours in the colour space of this output."""
         return from_srgb(rgb, self.output.colorspace)
 
+    @property
+    def rounding(self) -> float:
+        """How far `quantized` may move a value, in steps."""
+        return 1.5 if self.output.options["dither"] else 0.5
+
     def quantized(self, slab: FloatArray, z: int, dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
         """The same as whole numbers, 0 .. 255 or 0 .. 65535 for [0, 1], dithered if the output asks for it."""
-        dither = bool(self.output.options.get("dither"))
+        dither = bool(self.output.options["dither"])
         return quantize(self.colors(slab), dtype, noise=triangular(slab.shape, z) if dither else None)
 
 

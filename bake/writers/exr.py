@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,15 +18,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.color import LINEAR, SRGB
+from solidgrain.bake.color import LINEAR, SRGB, to_linear
 from solidgrain.bake.frames import frame_paths
 from solidgrain.bake.store import Bytes, Encoded, Finished, Store
 from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.workers import Workers
 
+LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # relative luminance of linear Rec.709 (ITU-R BT.709)
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # xy of red, green, blue, white (ITU-R BT.709)
-LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # ITU-R BT.709
+HALF_LARGEST = np.float32(65504)
 SOURCES = ("r", "g", "b", "luma", "one")
 TYPES = {"half": np.float16, "float": np.float32}
 COMPRESSIONS = ("none", "zip", "zips", "piz", "dwaa")
@@ -33,6 +35,7 @@ OPTIONS = (
     Option("type", "half", "of the channels", tuple(TYPES)),
     Option("compression", "zip", "dwaa is lossy", COMPRESSIONS),
     Option("channels", "R=r,G=g,B=b", "names, each with what it holds: r, g, b, luma or one, as in R=r,G=g,B=b,height=luma"),
+    Option("axis", "z", "across which the slices lie", ("x", "y", "z")),
     Option("start", 1, "number of the first slice"),
 )
 
@@ -61,17 +64,35 @@ class ExrStack(Writer):
         import OpenEXR
 
         file = io.BytesIO()
-        OpenEXR.File(slice_header(self.output, self.volume, z), self._channels(self.colors(rgb))).write(file)
+        OpenEXR.File(slice_header(self.output, self.volume, z), self._channels(rgb)).write(file)
         return file.getvalue()
 
-    def _channels(self, rgb: FloatArray) -> dict[str, npt.NDArray[np.generic]]:
+    def _channels(self, srgb: FloatArray) -> dict[str, npt.NDArray[np.generic]]:
         """What the file's channels hold, [y, x] each; plain RGB in one piece, which is faster."""
-        dtype = TYPES[str(self.output.options["type"])]
+        dtype, rgb = TYPES[str(self.output.options["type"])], self.colors(srgb)
+        if dtype is np.float16 and self.output.colorspace not in (LINEAR, SRGB):
+            rgb = rgb.clip(-HALF_LARGEST, HALF_LARGEST)  # beyond it, half-float is infinite
         if list(self.channels.items()) == [("R", "r"), ("G", "g"), ("B", "b")]:
             return {"RGB": np.ascontiguousarray(rgb, dtype)}
-        values = {"luma": rgb @ LUMA, "one": np.ones(rgb.shape[:2], dtype)}
+        values = {"luma": to_linear(srgb) @ LUMA, "one": np.ones(rgb.shape[:2], dtype)}
         values |= {source: rgb[..., k] for k, source in enumerate("rgb")}
         return {name: np.ascontiguousarray(values[source], dtype) for name, source in self.channels.items()}
+
+    def probe(self, voxels: npt.NDArray[np.int64]) -> tuple[FloatArray, float] | None:
+        import OpenEXR
+
+        names = {source: name for name, source in self.channels.items()}
+        if not {"r", "g", "b"} <= set(names) or self.output.options["compression"] == "dwaa":
+            return None
+        values = np.empty((len(voxels), 3), np.float32)
+        for z in np.unique(voxels[:, 2]):
+            here = voxels[:, 2] == z
+            with OpenEXR.File(os.fspath(self.paths[z]), separate_channels=True) as file:
+                channels = file.channels()
+                for k, source in enumerate("rgb"):
+                    values[here, k] = channels[names[source]].pixels[voxels[here, 1], voxels[here, 0]]
+        largest = max(1.0, float(np.abs(values).max()))
+        return values, largest * (2.0**-11 if self.output.options["type"] == "half" else 1e-6)
 
     def assemble(self, store: Store) -> list[Finished]:
         return [Finished(store.folder / path.name, path) for path in self.paths]
@@ -87,7 +108,7 @@ def slice_header(output: Output, volume: Volume, z: int) -> dict[str, Any]:
             OpenEXR, {"none": "NO"}.get(name := str(output.options["compression"]), name.upper()) + "_COMPRESSION"
         ),
         "type": OpenEXR.scanlineimage,
-        "colorInteropID": output.colorspace,
+        **color_attributes(output),
         "solidgrain:texture": volume.texture,
         "solidgrain:model": volume.sampler_sha256,
         "solidgrain:seed": str(volume.seed),  # may exceed an EXR int
@@ -98,12 +119,27 @@ def slice_header(output: Output, volume: Volume, z: int) -> dict[str, Any]:
         "solidgrain:json": json.dumps({"origin": volume.origin, "spacing": volume.spacing}),  # unrounded
         "solidgrain:axes": f"column {column}, row {row} downwards from the top, slice {along}",
     }
-    if output.colorspace in (LINEAR, SRGB):
-        header["chromaticities"] = REC709
     if volume.tile:
         wraps = ["periodic" if axis in volume.tile else "black" for axis in "xy"]
         header |= {"wrapmodes": ",".join(wraps), "solidgrain:tile": volume.tile}
     return header
+
+
+def color_attributes(output: Output) -> dict[str, Any]:
+    """How a header says the colour space: the standard attributes if it has an interop identifier, else its name.
+
+    `oiio:ColorSpace` is what OpenImageIO goes by where `colorInteropID` is absent.
+    """
+    colorspace = output.colorspace
+    if colorspace in (SRGB, LINEAR):
+        return {"colorInteropID": colorspace, "chromaticities": REC709}
+    from solidgrain.bake.ocio import chromaticities, interop_id
+
+    if not (identifier := interop_id(colorspace)):
+        named = {"oiio:ColorSpace": colorspace, "solidgrain:colorspace": colorspace}
+        return {**named, "solidgrain:colorconfig": str(output.options["colorconfig"])}
+    primaries = chromaticities(identifier)
+    return {"colorInteropID": identifier, **({"chromaticities": primaries} if primaries else {})}
 
 
 def parse_channels(output: Output) -> dict[str, str]:

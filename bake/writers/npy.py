@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 
 import numpy as np
+import numpy.typing as npt
 
 from solidgrain.bake.store import Encoded, Store
 from solidgrain.bake.writers.base import FloatArray, Output, SequenceWriter, Volume, data
@@ -19,6 +20,10 @@ class NpyFile(SequenceWriter):
 
     def header(self, store: Store) -> bytes:
         return _header(self.volume)
+
+    def probe(self, voxels: npt.NDArray[np.int64]) -> tuple[FloatArray, float]:
+        array = np.load(self.output.path, mmap_mode="r")
+        return array[voxels[:, 2], voxels[:, 1], voxels[:, 0]], 1e-6
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
         return data(np.ascontiguousarray(self.colors(slab), "<f4").data)

@@ -1,7 +1,8 @@
 """The preview: a PNG with the three middle slices and the block itself, turned, as one looks at it from above.
 
 Left to right: z, y and x middle slice (the second and third with z upwards), then the block with its faces x = last, y = 0 and
-z = last. Only those six planes are kept while the volume streams by, thinned to 512 samples an axis.
+z = last. Axes that tile are shown twice, so that a seam would be seen. Only those six planes are kept while the volume streams
+by, thinned to 512 samples an axis.
 """
 
 from __future__ import annotations
@@ -63,9 +64,9 @@ class PreviewFile(Writer):
         return thinned[:, plane.index, ::thin_x] if plane.axis == 1 else thinned[:, ::thin_y, plane.index]
 
     def assemble(self, store: Store) -> list[Finished]:
-        planes = {plane: self._plane(plane, store) for plane in [*self.middles, *self.faces]}
+        planes = {plane: self._repeated(plane, self._plane(plane, store)) for plane in [*self.middles, *self.faces]}
         slices = [planes[plane] if plane.axis == 2 else planes[plane][::-1] for plane in self.middles]
-        block = draw_block([planes[plane] for plane in self.faces], self.volume.shape[::-1])
+        block = draw_block([planes[plane] for plane in self.faces], self._extents())
         gap = np.full((PANEL, GAP, 3), BACKGROUND, np.float32)
         panels = [part for picture in [*map(fit, slices), block] for part in (picture, gap)][:-1]
         staged = store.folder / "preview.png"
@@ -77,6 +78,15 @@ class PreviewFile(Writer):
         shape = [(levels, rows), (levels, columns), (rows, columns)][plane.axis]
         path = store.joined(f"axis{plane.axis}-{plane.index}")
         return np.fromfile(path, np.float32).reshape(*shape, 3)
+
+    def _repeated(self, plane: Plane, picture: FloatArray) -> FloatArray:
+        """A plane twice along each axis that tiles: a seam would show in the middle."""
+        rows, columns = ("zyx"[axis] for axis in range(3) if axis != 2 - plane.axis)
+        return np.tile(picture, (1 + (rows in self.volume.tile), 1 + (columns in self.volume.tile), 1))
+
+    def _extents(self) -> list[int]:
+        """Voxels along x, y and z, repeats included."""
+        return [extent * (1 + (axis in self.volume.tile)) for axis, extent in zip("xyz", self.volume.shape[::-1], strict=True)]
 
     def _write(self, path: Path, picture: npt.NDArray[np.generic]) -> None:
         """OpenImageIO reports success on a full disk: only reading the file back tells."""

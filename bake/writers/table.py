@@ -6,8 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from solidgrain.bake.color import LINEAR, SRGB
+from solidgrain.bake.color import LINEAR, SRGB, color_options
 from solidgrain.bake.writers.base import Option, Output, Volume, Writer
+from solidgrain.bake.writers.mips import FILTERS, MippedWriter, level_output, level_volumes
+from solidgrain.bake.writers.orient import SPOOL_BYTES, UPRIGHT, OrientedWriter, oriented
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.workers import Workers
 
@@ -22,17 +24,29 @@ class Format:
     colorspace: str  # of its colours, unless --colorspace says otherwise
     files: Callable[[Output, Volume], list[Path]] = lambda output, volume: [output.path]
     options: tuple[Option, ...] = ()
+    scratch: Callable[[Output], int] = lambda output: 0  # bytes per voxel that its staging holds besides the final files
+    levels_inside: bool = False  # mip levels are in the file itself
     check: Callable[[Output, Volume], None] = lambda output, volume: None  # raises UsageError or BakeError
 
 
 def formats() -> dict[str, Format]:
     """Formats import their libraries when they are opened, so the whole table costs nothing."""
-    from solidgrain.bake.writers import exr, npy, preview, vti
+    from solidgrain.bake.writers import atlas, dds, exr, npy, preview, raw, vdb, vti
+
+    def atlas_of(colorspace: str) -> Format:
+        return Format(
+            "atlas", atlas.AtlasFile, atlas.size, colorspace, atlas.files, atlas.OPTIONS, atlas.scratch, check=atlas.check
+        )
 
     return {
-        ".exr": Format("exr", exr.ExrStack, exr.size, LINEAR, exr.files, exr.OPTIONS, exr.check),
+        ".exr": Format("exr", exr.ExrStack, exr.size, LINEAR, exr.files, exr.OPTIONS, check=exr.check),
         ".vti": Format("vti", vti.VtiFile, vti.size, SRGB, options=vti.OPTIONS),
         ".npy": Format("npy", npy.NpyFile, npy.size, SRGB),
+        ".vdb": Format("vdb", vdb.VdbFile, vdb.size, LINEAR, options=vdb.OPTIONS, scratch=vdb.scratch, check=vdb.check),
+        ".dds": Format("dds", dds.DdsFile, dds.size, SRGB, options=dds.OPTIONS, levels_inside=True, check=dds.check),
+        ".raw": Format("raw", raw.RawFile, raw.size, SRGB, raw.files, raw.OPTIONS),
+        ".atlas.png": atlas_of(SRGB),
+        ".atlas.exr": atlas_of(LINEAR),
         PREVIEW: Format("preview", preview.PreviewFile, preview.size, SRGB),
     }
 
@@ -56,36 +70,85 @@ def make_output(path: Path, kind: str = "", **options: str | int) -> Output:
     """The output that a file name asks for, every option filled in. Raises UsageError for what no writer knows."""
     kind = kind or kind_of(path)
     row = formats()[kind]
-    known = {option.name: option.default for option in row.options} | {"colorspace": row.colorspace, **COMMON}
+    known = {option.name: option.default for option in row.options} | {
+        "colorspace": row.colorspace,
+        "colorconfig": "",
+        **COMMON,
+    }
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise UsageError(f"{path}: unknown option {unknown[0]!r} of {row.name}; pick one of {', '.join(sorted(known))}")
     for option in row.options:
         if option.choices and options.get(option.name, option.default) not in option.choices:
             raise UsageError(f"{path}: {option.name} {options[option.name]!r}, expected one of {', '.join(option.choices)}")
-    return Output(path, kind, known | {name: value for name, value in options.items() if value != ""})
+    if options.get("mips", "") not in ("", *FILTERS):
+        raise UsageError(f"{path}: mips {options['mips']!r}, expected one of {', '.join(FILTERS)}")
+    filled = known | {name: value for name, value in options.items() if value != ""}
+    return Output(path, kind, filled | color_options(str(filled["colorspace"]), str(filled["colorconfig"])))
 
 
-COMMON: dict[str, str | int] = {"dither": 0}  # options of every format
+COMMON: dict[str, str | int] = {"dither": 0, "mips": "", "axes": UPRIGHT, "engine": ""}  # options of every format
 
 
 def open_writer(output: Output, volume: Volume, workers: Workers) -> Writer:
-    return formats()[output.kind].opener(output, volume, workers)
+    """The writer of an output: its format's, with mip levels and turned as the output asks for."""
+    axes = axes_of(output)
+    if axes == UPRIGHT:
+        return _upright(output, volume, workers)
+    return OrientedWriter(output, volume, workers, axes, _upright)
+
+
+def _upright(output: Output, volume: Volume, workers: Workers) -> Writer:
+    row = formats()[output.kind]
+    if output.options["mips"]:
+        return MippedWriter(output, volume, workers, row.opener, row.levels_inside)
+    return row.opener(output, volume, workers)
+
+
+def axes_of(output: Output) -> str:
+    """Which axes of the texture the x, y and z of an output's files are."""
+    return SLICE_AXES.get(str(output.options.get("axis", "")), str(output.options["axes"]))
+
+
+SLICE_AXES = {"x": "+y+z+x", "y": "+x+z+y"}  # of stacks whose slices lie across x or y
+
+
+def _levels(output: Output, volume: Volume) -> list[tuple[Output, Volume]]:
+    """An output and its volume as its files hold it; and those of its mip levels, where they are files of their own."""
+    turned = oriented(volume, axes_of(output)) if axes_of(output) != UPRIGHT else volume
+    below = level_volumes(turned) if output.options["mips"] and not formats()[output.kind].levels_inside else []
+    return [(output, turned), *((level_output(output, level.level), level) for level in below)]
 
 
 def output_files(output: Output, volume: Volume) -> list[Path]:
     """The files that an output will be, as absolute paths."""
-    return [path.absolute() for path in formats()[output.kind].files(output, volume)]
+    row = formats()[output.kind]
+    return [path.absolute() for level in _levels(output, volume) for path in row.files(*level)]
 
 
 def output_bytes(output: Output, volume: Volume) -> int:
     """The most bytes that an output can take (compressed formats take less)."""
-    return formats()[output.kind].size(output, volume)
+    row, levels = formats()[output.kind], _levels(output, volume)
+    inside = level_volumes(levels[0][1]) if output.options["mips"] and row.levels_inside else []
+    return sum(row.size(*level) for level in [*levels, *((output, level) for level in inside)])
+
+
+def scratch_bytes(output: Output, volume: Volume) -> int:
+    """The bytes that a bake keeps beside an output until it is whole, besides its files."""
+    per_voxel = formats()[output.kind].scratch(output) + (SPOOL_BYTES if axes_of(output) != UPRIGHT else 0)
+    reduced = 12 * volume.voxels * 2 // 7 if output.options["mips"] else 0  # a quarter, an eighth of that, ...
+    return volume.voxels * per_voxel + reduced
 
 
 def check_output(output: Output, volume: Volume) -> None:
     """Refuse what the format cannot hold. Raises UsageError or BakeError with the reason."""
-    formats()[output.kind].check(output, volume)
+    row = formats()[output.kind]
+    held, turned = _levels(output, volume)[0]
+    row.check(held, turned)
+    if output.options["engine"]:
+        from solidgrain.bake.engines import check_engine
+
+        check_engine(str(output.options["engine"]), held, turned)
 
 
 def output_exists(output: Output, volume: Volume) -> Path | None:

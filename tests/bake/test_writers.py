@@ -24,7 +24,7 @@ ORIGIN, SPACING = (10.0, -20.0, 1000.0), (1.0, 0.5, 2.0)
 VOXELS = [(0, 0, 0), (6, 0, 0), (0, 4, 0), (0, 0, 18), (6, 4, 18), (3, 1, 17)]
 
 
-def plan_for(texture, *outputs: Output, tile: str = "") -> Plan:
+def plan_for(texture, *outputs: Output, tile: str = "", size: tuple[int, int, int] = SIZE, **changes) -> Plan:
     return Plan(
         source="toy",
         texture="toy",
@@ -32,11 +32,12 @@ def plan_for(texture, *outputs: Output, tile: str = "") -> Plan:
         sampler_sha256=texture.data.sampler_sha256,
         precision="float32",
         seed=7,
-        size=SIZE,
+        size=size,
         origin=ORIGIN,
         spacing=SPACING,
         tile=tile,
         outputs=outputs,
+        **changes,
     )
 
 

@@ -1,0 +1,238 @@
+"""Many bakes from one file: `--jobs jobs.json` (or .toml).
+
+A job's keys are the flags of `solidgrain bake` with `_` for `-`, and `name` and `texture`; `defaults` hold for all jobs. An
+output is a file name, or an object with `path` and settings of its format. Relative paths are relative to the job file's
+folder. All jobs are checked before the first is baked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from solidgrain.bake.modes import WORK
+from solidgrain.runtime.errors import BakeError, SolidgrainError, UsageError
+
+if TYPE_CHECKING:
+    from solidgrain.bake.plan import Plan
+    from solidgrain.runtime import Texture
+
+DONE, FAILED, SKIPPED = "done", "failed", "skipped"
+OWN = ("name", "texture", "bundle", "out", "preview")  # keys that are more than the value of a flag
+PLAIN = frozenset((*WORK, "out", "preview"))  # flags that are no setting of a job, or one of its own keys
+
+Load = Callable[[argparse.Namespace], "Texture"]
+ToDo = Callable[["Plan", argparse.Namespace], "Plan"]
+Bake = Callable[["Plan", "Texture", argparse.Namespace], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A bake as its flags would say it. `settings` are of single outputs, by their paths."""
+
+    name: str
+    where: str  # file and place, for errors
+    arguments: argparse.Namespace
+    settings: dict[Path, dict[str, str | int]]
+
+    @property
+    def texture(self) -> tuple[str, str | None, str | None]:
+        """What tells its texture from another job's."""
+        return (self.arguments.source or "granite", self.arguments.bundle, self.arguments.precision or "float32")
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A job that can be baked. Its plan lacks the outputs that need nothing."""
+
+    job: Job
+    plan: Plan
+
+
+class JobParser(argparse.ArgumentParser):
+    """The flags of `solidgrain bake`, for the values of a job."""
+
+    def __init__(self) -> None:
+        from solidgrain.bake.flags import add_arguments
+
+        super().__init__(add_help=False, allow_abbrev=False)
+        add_arguments(self)
+
+    @property
+    def keys(self) -> list[str]:
+        """What a job may say besides its own keys."""
+        flags = (flag for action in self._actions for flag in action.option_strings)
+        return sorted({flag.lstrip("-").replace("-", "_") for flag in flags} - PLAIN)
+
+    def error(self, message: str) -> NoReturn:
+        flag = re.match(r"argument --([a-z-]+): ", message)
+        raise UsageError(f"{flag[1].replace('-', '_')}: {message[flag.end() :]}" if flag else message)
+
+
+def read_jobs(path: Path, work: argparse.Namespace) -> list[Job]:
+    """The jobs of a file, to be worked off as the flags `work` say. Raises UsageError."""
+    from solidgrain.bake.schema import read_data, validate
+
+    values = read_data(path)
+    validate(values, "jobs", str(path))
+    parser, defaults = JobParser(), values.get("defaults", {})
+    jobs: list[Job] = []
+    for number, own in enumerate(values["jobs"]):
+        where = f"{path}: jobs[{number}] {own['name']!r}"
+        if any(job.name == own["name"] for job in jobs):
+            raise UsageError(f"{where}: another job has this name, give each its own")
+        with _named(where):
+            jobs.append(_read_job(parser, {**defaults, **own}, where, path.parent, work))
+    return jobs
+
+
+def _read_job(parser: JobParser, values: dict[str, Any], where: str, folder: Path, work: argparse.Namespace) -> Job:
+    arguments = argparse.Namespace(**{name: value for name, value in vars(work).items() if name in WORK})
+    parser.parse_args(
+        [word for key, value in values.items() if key not in OWN for word in _flag(parser, key, value)], arguments
+    )
+    arguments.source = _source(values.get("texture"), folder)
+    arguments.bundle = os.fspath(folder / values["bundle"]) if "bundle" in values else None
+    given = values.get("out", [])
+    outputs: list[dict[str, Any]] = [
+        {"path": out} if isinstance(out, str) else dict(out) for out in (given if isinstance(given, list) else [given])
+    ]
+    settings = {folder / out.pop("path"): out for out in outputs}
+    if len(settings) < len(outputs):
+        raise UsageError("out: two outputs have the same name")
+    arguments.out = list(settings)
+    arguments.preview = folder / values["preview"] if "preview" in values else None
+    if not arguments.out and not arguments.preview:
+        raise UsageError("nothing to write: give it out or preview")
+    return Job(values["name"], where, arguments, settings)
+
+
+def _flag(parser: JobParser, key: str, value: Any) -> list[str]:
+    """A key and its value as words of a command line."""
+    if key not in parser.keys:
+        close = difflib.get_close_matches(key, [*parser.keys, *OWN], 1)
+        raise UsageError(
+            f"unknown key {key!r}" + (f"; did you mean {close[0]}?" if close else ", expected a flag of solidgrain bake")
+        )
+    flag = f"--{key.replace('_', '-')}"
+    if isinstance(value, bool):
+        return [flag] if value else []
+    return [f"{flag}={','.join(map(str, _flat(value)))}"]
+
+
+def _flat(value: Any) -> Iterator[Any]:
+    if isinstance(value, list):
+        for part in value:
+            yield from _flat(part)
+    else:
+        yield value
+
+
+def _source(texture: str | None, folder: Path) -> str | None:
+    """A texture by its embedded name, or by its path from the job file's folder."""
+    from solidgrain.runtime.bundle import embedded_names
+
+    if texture is None or texture in embedded_names():
+        return texture
+    return os.fspath(folder / texture) if os.sep in texture or (folder / texture).exists() else texture
+
+
+def plan_jobs(jobs: Sequence[Job], load: Load, to_do: ToDo) -> tuple[list[Planned], dict[object, Texture]]:
+    """Plans for all jobs and their textures, each loaded once, after every check. Raises what speaks against any of them."""
+    from solidgrain.bake.flags import make_plan
+
+    textures: dict[object, Texture] = {}
+    planned: list[Planned] = []
+    for job in jobs:
+        with _named(job.where):
+            if job.texture not in textures:
+                textures[job.texture] = load(job.arguments)
+            planned.append(Planned(job, _with_settings(make_plan(job.arguments, textures[job.texture]), job)))
+    checked = []
+    for one in planned:
+        with _named(one.job.where):
+            checked.append(replace(one, plan=to_do(one.plan, one.job.arguments)))
+    _check_names(planned)  # last: the list of a volume's files is bounded by its memory, which is checked now
+    return checked, textures
+
+
+def _with_settings(plan: Plan, job: Job) -> Plan:
+    """The plan with what the job says of single outputs."""
+    from solidgrain.bake.schema import checked_output
+
+    outputs = (
+        checked_output(output, f"out {output.path.name}", **job.settings.get(output.path, {})) for output in plan.outputs
+    )
+    return replace(plan, outputs=tuple(outputs))
+
+
+def _check_names(planned: Sequence[Planned]) -> None:
+    """No two jobs may write the same file, or work in the same staging folder."""
+    from solidgrain.bake.manifest import manifest_path
+    from solidgrain.bake.writers import output_files
+
+    taken: dict[str, str] = {}
+    for one in planned:
+        own: dict[str, str] = {}
+        for output in one.plan.outputs:
+            folder = output.path.parent.resolve()
+            names = [*(path.name for path in output_files(output, one.plan.volume)), manifest_path(output.path).name]
+            own |= {str(folder / name): one.job.name for name in names}
+        if clash := next((name for name in own if name in taken), None):
+            raise UsageError(f"{one.job.where}: would write {clash}, as job {taken[clash]!r} does; give each its own files")
+        taken |= own
+
+
+def bake_jobs(
+    planned: Sequence[Planned],
+    textures: dict[object, Texture],
+    bake: Bake,
+    on_error: Callable[[str], None],
+    continue_on_error: bool,
+) -> list[dict[str, Any]]:
+    """Bake one job after the other; after a failure the rest is skipped, unless told to go on. Returns a line for each job.
+
+    A texture is let go of when the last of its jobs is done.
+    """
+    report: list[dict[str, Any]] = []
+    for number, one in enumerate(planned):
+        if any(line["status"] == FAILED for line in report) and not continue_on_error:
+            report.append(_line(one, SKIPPED, note="a job before it failed"))
+            continue
+        report.append(_bake_job(one, textures[one.job.texture], bake))
+        if report[-1]["error"]:
+            on_error(report[-1]["error"])
+        if all(later.job.texture != one.job.texture for later in planned[number + 1 :]):
+            del textures[one.job.texture]
+    return report
+
+
+def _bake_job(one: Planned, texture: Texture, bake: Bake) -> dict[str, Any]:
+    if not one.plan.outputs:
+        return _line(one, SKIPPED, note="its files are there")
+    try:
+        result = bake(one.plan, texture, one.job.arguments)
+    except SolidgrainError as error:
+        return _line(one, FAILED, error=f"{one.job.where}: {error}")
+    return _line(one, DONE, seconds=result["seconds"], files=result["files"])
+
+
+def _line(one: Planned, status: str, **values: Any) -> dict[str, Any]:
+    return {"name": one.job.name, "status": status, "seconds": 0.0, "files": [], "error": None, "note": None, **values}
+
+
+@contextmanager
+def _named(where: str) -> Iterator[None]:
+    """Errors that say which job they are about."""
+    try:
+        yield
+    except SolidgrainError as error:
+        kind = UsageError if isinstance(error, UsageError) else BakeError
+        raise kind(f"{where}: {error}") from error

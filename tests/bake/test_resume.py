@@ -1,0 +1,307 @@
+"""A bake that was stopped at any moment, shared out, or run twice ends in the files of an undisturbed one."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from solidgrain.bake.baker import bake, merge
+from solidgrain.bake.staging import open_staging, staging_folder
+from solidgrain.bake.writers import PREVIEW, make_output
+from solidgrain.runtime import BakeError
+from tests.bake.test_writers import SIZE, plan_for
+
+NAMES = ("a.####.exr", "a.vti", "z.vti", "a.npy", "x.####.exr", "m.npy", "m.####.exr", "a.png")
+
+
+def outputs(folder: Path, names: tuple[str, ...] = NAMES) -> list:
+    """One output of every way to keep bytes: files, streams, compressed streams, turned, with mips, and planes."""
+    options: dict[str, dict[str, str | int]] = {
+        "z.vti": {"compression": "zlib"},
+        "x.####.exr": {"axis": "x"},
+        "m.npy": {"mips": "kaiser"},
+        "m.####.exr": {"mips": "box"},
+    }
+    kinds = {"a.png": PREVIEW}
+    return [make_output(folder / name, kinds.get(name, ""), **options.get(name, {})) for name in names]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files but the manifests, which name the folder."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.endswith(".bake.json")}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(toy, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("undisturbed")
+    bake(plan_for(toy, *outputs(folder)), toy)
+    return contents(folder)
+
+
+class Stop(Exception):
+    """Stands for a kill between two slabs."""
+
+
+def stop_after(slices: int):
+    def on_slice(done: int, total: int) -> None:
+        if done >= slices:
+            raise Stop
+
+    return on_slice
+
+
+def test_a_resumed_bake_evaluates_only_what_is_missing(toy, tmp_path, undisturbed):
+    plan = plan_for(toy, *outputs(tmp_path))
+    with pytest.raises(Stop):
+        bake(plan, toy, stop_after(16), resume=True)
+    baked = bake(plan, toy, resume=True)
+    assert baked.reused_slices == 16
+    assert contents(tmp_path) == undisturbed
+
+
+def test_without_resume_nothing_is_left_and_nothing_is_reused(toy, tmp_path, undisturbed):
+    plan = plan_for(toy, *outputs(tmp_path))
+    with pytest.raises(Stop):
+        bake(plan, toy, stop_after(16))
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(Stop):
+        bake(plan, toy, stop_after(16), resume=True)
+    assert bake(plan, toy).reused_slices == 0
+    assert contents(tmp_path) == undisturbed
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "grow", "remove", "tear"])
+def test_bytes_that_a_crash_damaged_are_made_again(toy, tmp_path, undisturbed, damage):
+    plan = plan_for(toy, *outputs(tmp_path))
+    with pytest.raises(Stop):
+        bake(plan, toy, stop_after(SIZE[2]), resume=True)
+    for folder in tmp_path.glob(".*.baking"):
+        name = "journal.*" if damage == "tear" else "[a-z]*[.0-9][0-9][0-9][0-9]*"
+        for path in sorted(
+            path for path in folder.glob(name) if damage == "tear" or not path.name.startswith(("journal", "lock"))
+        ):
+            content = bytearray(path.read_bytes())
+            if damage == "remove":
+                path.unlink()
+                continue
+            if damage == "flip":
+                content[len(content) // 2] ^= 1
+            path.write_bytes(
+                content[: len(content) - 7] if damage in ("cut", "tear") else content + b"xyz" * (damage == "grow")
+            )
+    bake(plan, toy, resume=True)
+    assert contents(tmp_path) == undisturbed
+
+
+def test_shards_in_any_order_and_in_several_processes_merge_to_the_same_files(toy, tmp_path, undisturbed):
+    plan = plan_for(toy, *outputs(tmp_path))
+    assert [plan.shard(k, 3) for k in (1, 2, 3)] == [(0, 0), (0, 16), (16, 19)]
+    with pytest.raises(BakeError, match="slices 0 to 18 are missing"):
+        merge(plan, toy.workers)
+    for shard in ((16, 19), (0, 16)):
+        assert bake(plan, toy, shard=shard).files == []
+    assert bake(plan, toy, shard=(0, 16)).reused_slices == 16
+    merge(plan, toy.workers)
+    assert contents(tmp_path) == undisturbed
+
+
+def test_many_shards_are_whole_slabs_and_cover_every_slice_once(toy):
+    plan = plan_for(toy, size=(4, 4, 1000))
+    for count in (1, 2, 7, 63, 64, 100):
+        shards = [plan.shard(k, count) for k in range(1, count + 1)]
+        assert [z for first, stop in shards for z in range(first, stop)] == list(range(1000))
+        assert all(first % plan.slab == 0 for first, _ in shards)
+
+
+def test_a_missing_shard_is_named(toy, tmp_path):
+    plan = plan_for(toy, *outputs(tmp_path))
+    bake(plan, toy, shard=(0, 16))
+    with pytest.raises(BakeError, match="slices 16 to 18 are missing"):
+        merge(plan, toy.workers)
+
+
+def test_work_of_another_plan_is_never_reused_silently(toy, tmp_path):
+    with pytest.raises(Stop):
+        bake(plan_for(toy, *outputs(tmp_path, ("a.vti",))), toy, stop_after(16), resume=True)
+    for changes in ({"size": (7, 5, 20)}, {"samples": 8}, {"tile": "x"}):
+        with pytest.raises(BakeError, match=r"a\.vti: an unfinished bake of another plan.*different: "):
+            bake(plan_for(toy, *outputs(tmp_path, ("a.vti",)), **changes), toy, resume=True)
+
+
+def test_two_processes_cannot_write_the_same_output(toy, tmp_path):
+    plan = plan_for(toy, *outputs(tmp_path, ("a.vti",)))
+    (output,) = plan.outputs
+    owner = open_staging(output.path, plan.work(output), SIZE[2], 0, None, fresh=True)
+    try:
+        with pytest.raises(BakeError, match="another process is baking it"):
+            bake(plan, toy)
+        with pytest.raises(BakeError, match="another process is baking it"):
+            bake(plan, toy, shard=(0, 16))
+    finally:
+        owner.close()
+    bake(plan, toy)
+
+
+def test_two_shards_can_be_baked_at_once_but_not_the_same_one(toy, tmp_path):
+    plan = plan_for(toy, *outputs(tmp_path, ("a.vti",)))
+    (output,) = plan.outputs
+    owner = open_staging(output.path, plan.work(output), SIZE[2], 0, (0, 16), fresh=False)
+    try:
+        with pytest.raises(BakeError, match="another process is baking it"):
+            bake(plan, toy, shard=(0, 16))
+        with pytest.raises(BakeError, match="another process is baking it"):
+            merge(plan, toy.workers)
+        bake(plan, toy, shard=(16, 19))
+    finally:
+        owner.close()
+
+
+def test_a_dead_owner_holds_no_lock(toy, tmp_path, toy_folder):
+    process = start(toy_folder, tmp_path, "--size", "512")
+    wait_for(lambda: list(tmp_path.glob(".a.vti.baking/journal.*")))
+    process.send_signal(signal.SIGSTOP)
+    refused = run(toy_folder, tmp_path, "--size", "512", "--resume")
+    assert refused.returncode == 1
+    assert "another process is baking it" in refused.stderr
+    process.kill()
+    process.communicate()
+    assert staging_folder(tmp_path / "a.vti").exists()
+    assert run(toy_folder, tmp_path, "--size", "8").returncode == 0  # another plan, without --resume: begins anew
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+@pytest.mark.parametrize("finals", [0, 1, 5, 19])
+def test_a_kill_between_two_renames_leaves_the_rest_to_be_done(toy, tmp_path, undisturbed, monkeypatch, finals):
+    plan = plan_for(toy, *outputs(tmp_path))
+    replaced, count = os.replace, 0
+
+    def fail(source, target):
+        nonlocal count
+        count += Path(target).parent == tmp_path
+        if count > finals and Path(target).parent == tmp_path:
+            raise Stop
+        replaced(source, target)
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(Stop):
+        bake(plan, toy, resume=True)
+    monkeypatch.undo()
+    bake(plan, toy, resume=True)
+    assert contents(tmp_path) == undisturbed
+
+
+def test_a_full_disk_fails_in_one_line_and_the_bake_goes_on_after_space_is_made(toy, tmp_path, undisturbed, monkeypatch):
+    plan = plan_for(toy, *outputs(tmp_path))
+    synced, left = os.fsync, 25
+
+    def full(number):
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise OSError(28, "No space left on device")
+        synced(number)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(BakeError, match="No space left on device"):
+        bake(plan, toy, resume=True)
+    monkeypatch.undo()
+    bake(plan, toy, resume=True)
+    assert contents(tmp_path) == undisturbed
+
+
+FLAGS = [
+    "--size",
+    "24x24x160",
+    "--out",
+    "a.####.exr",
+    "--out",
+    "a.vti",
+    "--out",
+    "z.npy",
+    "--mips",
+    "--vti-compression",
+    "zlib",
+]
+
+
+def test_kills_at_random_moments_end_in_the_same_files(tmp_path, toy_folder):
+    campaign(tmp_path, toy_folder, kills=12)
+
+
+@pytest.mark.slow
+def test_a_thousand_kills_at_random_moments_end_in_the_same_files(tmp_path, toy_folder):
+    campaign(tmp_path, toy_folder, kills=1000)
+
+
+def campaign(folder: Path, bundle: Path, kills: int) -> None:
+    """Kill resumed bakes with signal 9 until so many have died; each volume that gets finished must be the undisturbed one."""
+    (folder / "expected").mkdir()
+    command = [sys.executable, "-m", "solidgrain.bake.cli", "bake", str(bundle), "--quiet", *FLAGS]
+    started = time.monotonic()
+    subprocess.run(command, cwd=folder / "expected", check=True, env=quick())
+    seconds = time.monotonic() - started
+    expected = contents(folder / "expected")
+    draw, killed, finished = random.Random(7), 0, 0
+    while killed < kills or not finished:
+        target = folder / f"try{finished}"
+        target.mkdir(exist_ok=True)
+        process = subprocess.Popen([*command, "--resume"], cwd=target, env=quick())
+        try:
+            code = process.wait(draw.uniform(0.3, 1.0) * seconds if killed < kills else 120)
+            assert code == 0
+            assert contents(target) == expected
+            finished += 1
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            killed += 1
+
+
+def quick() -> dict[str, str]:
+    """One thread for libraries that would start more."""
+    return {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def start(bundle: Path, folder: Path, *flags: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "solidgrain.bake.cli", "bake", str(bundle), "--quiet", "--out", "a.vti", *flags]
+    return subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
+
+
+def run(bundle: Path, folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+    process = start(bundle, folder, *flags)
+    _, err = process.communicate(timeout=60)
+    return subprocess.CompletedProcess(process.args, process.returncode, "", err)
+
+
+def wait_for(condition) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_resume_update_and_shards_on_the_command_line(solidgrain, tmp_path, toy_folder, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    flags = ("bake", toy_folder, "--size", "6x5x40", "--out", "a.####.exr", "--out", "a.npy")
+    assert solidgrain(*flags, "--shard", "2/2").code == 0
+    assert [path.name for path in tmp_path.iterdir() if not path.name.startswith(".")] == []
+    assert solidgrain(*flags, "--resume").code == 0
+    first = contents(tmp_path)
+    assert "already exists" in solidgrain(*flags).error
+    for again in ("--resume", "--update", "--shard=1/2"):
+        report = json.loads(solidgrain(*flags, again, "--json", "--quiet").out)
+        assert report["files"] == []
+    (tmp_path / "a.0007.exr").write_bytes(b"damaged")
+    assert "already exists" in solidgrain(*flags, "--resume").error
+    assert solidgrain(*flags, "--update").code == 0
+    assert contents(tmp_path) == first
+    assert solidgrain("bake", toy_folder, "--size", "6x5x41", "--out", "a.npy", "--update").code == 0
+    assert (tmp_path / "a.npy").stat().st_size == 128 + 6 * 5 * 41 * 12

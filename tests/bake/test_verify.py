@@ -1,0 +1,96 @@
+"""`solidgrain verify` finds what is not as it was written, and what was not written as the texture is."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from solidgrain.export.bundle import Details, write_bundle
+from tests.toy import toy_weights
+
+FLAGS = ("--size", "12x8x20", "--seed", 3, "--tile", "x", "--samples", 8, "--transform", "0,1,0,5,-1,0,0,3,0,0,2,1,0,0,0,1")
+OUTPUTS = {
+    "a.npy": (),
+    "a.vti": (),
+    "z.vti": ("--vti-compression", "zlib", "--vti-type", "uint16"),
+    "a.####.exr": (),
+    "f.####.exr": ("--exr-type", "float", "--exr-axis", "y", "--exr-channels", "albedo.R=r,albedo.G=g,albedo.B=b,Y=luma"),
+    "m.npy": ("--mips",),
+}
+
+
+@pytest.fixture
+def files(solidgrain, tmp_path, toy_folder, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, flags in OUTPUTS.items():
+        assert solidgrain("bake", toy_folder, *FLAGS, "--out", name, *flags, "--quiet").code == 0
+    return tmp_path
+
+
+def test_what_was_baked_is_sound_wherever_it_lies(solidgrain, files, tmp_path_factory):
+    moved = tmp_path_factory.mktemp("moved") / "here"
+    files.rename(moved)
+    outcome = solidgrain("verify", *[moved / name for name in OUTPUTS], "--json")
+    assert outcome.code == 0
+    for output in json.loads(outcome.out)["outputs"]:
+        assert output["sound"]
+        assert output["voxels"] == 256
+        assert output["largest"] < 2e-4
+
+
+@pytest.mark.parametrize(("name", "damaged"), [("a.npy", "a.npy"), ("a.####.exr", "a.0004.exr"), ("m.npy", "m.mip2.npy")])
+@pytest.mark.parametrize("damage", ["flip", "cut", "remove"])
+def test_a_damaged_file_is_named(solidgrain, files, name, damaged, damage):
+    content = bytearray((files / damaged).read_bytes())
+    content[300] ^= 1
+    if damage == "remove":
+        (files / damaged).unlink()
+    else:
+        (files / damaged).write_bytes(content[:-1] if damage == "cut" else content)
+    outcome = solidgrain("verify", name)
+    assert outcome.code == 3
+    assert damaged in outcome.out
+
+
+def test_files_that_are_whole_but_of_something_else_are_found(solidgrain, files):
+    """As if another seed had been baked: the checksums fit the files, the colours do not fit the plan."""
+    manifest = json.loads((files / "a.npy.bake.json").read_text())
+    manifest["plan"]["seed"] = 4
+    (files / "a.npy.bake.json").write_text(json.dumps(manifest))
+    outcome = solidgrain("verify", "a.npy")
+    assert outcome.code == 3
+    assert "differ from the texture" in outcome.out
+    assert solidgrain("verify", "a.npy", "--voxels", 0).code == 0
+
+
+def test_one_wrong_voxel_in_ten_thousand_checksums_aside(solidgrain, files):
+    """A plan is evaluated again voxel by voxel, exactly as the bake did it in slabs."""
+    outcome = solidgrain("verify", "a.npy", "--voxels", 12 * 8 * 20, "--json")
+    assert json.loads(outcome.out)["outputs"][0]["largest"] < 1e-6
+
+
+def test_another_texture_under_the_same_name_is_named(solidgrain, tmp_path):
+    folder = write_bundle(tmp_path / "toy", toy_weights(), Details(name="toy", patch=64))
+    assert solidgrain("bake", folder, "--size", 4, "--out", tmp_path / "a.npy", "--quiet").code == 0
+    for path in sorted(folder.iterdir()):
+        path.unlink()
+    folder.rmdir()
+    weights = toy_weights()
+    weights.transforms[3] *= np.float64(1.01)
+    write_bundle(folder, weights, Details(name="toy", patch=64))
+    outcome = solidgrain("verify", tmp_path / "a.npy")
+    assert outcome.code == 1
+    assert "made with the texture" in outcome.error
+
+
+@pytest.mark.parametrize(
+    ("content", "message"), [(None, "cannot read"), ("{", "not JSON"), ("{}", "not a manifest"), ("[]", "not a manifest")]
+)
+def test_a_manifest_that_is_none_is_refused_in_one_line(solidgrain, tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "a.vti.bake.json").write_text(content)
+    outcome = solidgrain("verify", tmp_path / "a.vti")
+    assert outcome.code == 1
+    assert message in outcome.error
