@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 WHEEL_VENV := build/wheel-venv
 
-.PHONY: install check test test-slow wheel test-wheel sanitize bench pictures clean
+.PHONY: install check test test-slow wheel test-wheel sanitize bench bench-bake pictures clean
 
 install: $(VENV)/installed
 
@@ -55,6 +55,9 @@ sanitize: install
 
 bench: install
 	$(BIN)/python -m tests.bench.bench
+
+bench-bake: install
+	$(BIN)/python -m tests.bench.bakes --large
 
 pictures: install
 	$(BIN)/python docs/pictures.py

@@ -129,7 +129,7 @@ def _complete(plan: Plan, jobs: Sequence[Job]) -> list[Path]:
     for job, lines in zip(jobs, finished, strict=True):
         manifest_path(job.output.path).unlink(missing_ok=True)  # of files that are about to be replaced
         files += job.staging.commit(lines)
-        write_manifest(plan, job.output, lines)
+        write_manifest(plan, job.output, lines, job.staging.folder)
         job.staging.clear()
     return files
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from solidgrain.bake.manifest import manifest_path
 from solidgrain.bake.plan import Plan, format_bytes, format_size
 from solidgrain.bake.staging import staged_bytes
 from solidgrain.bake.writers import Output, check_output, output_bytes, output_exists, output_files, scratch_bytes
@@ -28,6 +29,8 @@ def check_plan(plan: Plan, overwrite: bool, begun: Sequence[Output] = ()) -> Non
     for output in plan.outputs:
         for path in output_files(output, plan.volume):
             _check_file(path, overwrite or output in begun, taken)
+    for output in plan.outputs:
+        _check_name(manifest_path(output.path).absolute(), taken)
 
 
 def without_existing(plan: Plan) -> Plan:
@@ -38,13 +41,17 @@ def without_existing(plan: Plan) -> Plan:
 
 
 def _check_file(path: Path, overwrite: bool, taken: set[Path]) -> None:
-    if path in taken:
-        raise UsageError(f"--out {path}: two outputs would write this file; give each a name of its own")
-    taken.add(path)
+    _check_name(path, taken)
     if path.is_dir():
         raise BakeError(f"{path}: is a folder, expected a file name")
     if not overwrite and path.exists():
         raise BakeError(f"{path}: already exists; use --overwrite to replace it or --no-clobber to keep it")
+
+
+def _check_name(path: Path, taken: set[Path]) -> None:
+    if path in taken:
+        raise UsageError(f"--out {path}: two outputs would write this file; give each a name of its own")
+    taken.add(path)
 
 
 def _check_folder(path: Path) -> None:

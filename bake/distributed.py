@@ -8,8 +8,6 @@ lock is free at once, and whoever is given the shard next takes up what is there
 from __future__ import annotations
 
 import argparse
-import asyncio
-import logging
 import os
 import signal
 import socket
@@ -65,7 +63,7 @@ def bake_on_cluster(
 
     started = time.monotonic()
     _check_leftovers(plan, overwrite)
-    with _connected(cluster, threads or texture.threads) as client:
+    with _connected(cluster) as client:
         each = max(1, (threads or texture.threads) // _workers(cluster)) if cluster.startswith(LOCAL) else threads
         count = shard_count(plan, shards)
         told = _run_shards(client, anywhere(plan), count, provider, each, on_slice)
@@ -160,8 +158,10 @@ def _workers(cluster: str) -> int:
 
 
 @contextmanager
-def _connected(cluster: str, threads: int) -> Iterator[Client]:
+def _connected(cluster: str) -> Iterator[Client]:
     """A client of a cluster that answers. A local one lives as long as this lasts."""
+    import logging
+
     from distributed import Client, LocalCluster
 
     if not cluster.startswith(LOCAL):
@@ -192,6 +192,8 @@ def _ignore_interrupts() -> None:
 
 def _check_scheduler(address: str) -> None:
     """Ask who is there: a client by itself waits forever for a listener that is no scheduler."""
+    import asyncio
+
     from distributed.core import rpc
 
     async def ask() -> None:

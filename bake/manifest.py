@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +23,21 @@ def manifest_path(output: Path) -> Path:
     return output.with_name(f"{name}{SUFFIX}")
 
 
-def write_manifest(plan: Plan, output: Output, files: list[dict[str, Any]]) -> Path:
-    """Say that an output is complete. `files` have a name ("final"), "bytes" and "sha256"."""
+def write_manifest(plan: Plan, output: Output, files: list[dict[str, Any]], staging: Path) -> Path:
+    """Say that an output is complete. `files` have a name ("final"), "bytes" and "sha256".
+
+    It is written in the staging folder, which a kill leaves to the next bake, and then put in place.
+    """
     values = {
         "plan": plan.to_json(),
         "output": output.path.name,
         "work": hash_of(plan.work(output)),
         "files": {file["final"]: {"bytes": file["bytes"], "sha256": file["sha256"]} for file in files},
     }
-    path = manifest_path(output.path)
-    with replacing(path) as file:
+    path, staged = manifest_path(output.path), staging / "manifest.json"
+    with replacing(staged) as file:
         file.write(json.dumps(values, indent=1).encode() + b"\n")
+    os.replace(staged, path)
     return path
 
 

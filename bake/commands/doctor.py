@@ -10,7 +10,10 @@ import platform
 from importlib.metadata import PackageNotFoundError, distributions, version
 from typing import Any
 
-PACKAGES = ("solidgrain", "numpy", "onnxruntime", "OpenEXR", "OpenImageIO", "pyvista", "vtk", "torch", "onnx", "spox")
+PACKAGES = (
+    *("solidgrain", "numpy", "onnxruntime", "OpenEXR", "OpenImageIO", "jsonschema", "etcpak", "distributed"),
+    *("pyvista", "vtk", "torch", "onnx", "spox"),
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -46,21 +46,21 @@ def undisturbed(toy, tmp_path_factory):
     return contents(folder)
 
 
-class Stop(Exception):
+class StopError(Exception):
     """Stands for a kill between two slabs."""
 
 
 def stop_after(slices: int):
     def on_slice(done: int, total: int) -> None:
         if done >= slices:
-            raise Stop
+            raise StopError
 
     return on_slice
 
 
 def test_a_resumed_bake_evaluates_only_what_is_missing(toy, tmp_path, undisturbed):
     plan = plan_for(toy, *outputs(tmp_path))
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         bake(plan, toy, stop_after(16), resume=True)
     baked = bake(plan, toy, resume=True)
     assert baked.reused_slices == 16
@@ -69,10 +69,10 @@ def test_a_resumed_bake_evaluates_only_what_is_missing(toy, tmp_path, undisturbe
 
 def test_without_resume_nothing_is_left_and_nothing_is_reused(toy, tmp_path, undisturbed):
     plan = plan_for(toy, *outputs(tmp_path))
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         bake(plan, toy, stop_after(16))
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         bake(plan, toy, stop_after(16), resume=True)
     assert bake(plan, toy).reused_slices == 0
     assert contents(tmp_path) == undisturbed
@@ -81,7 +81,7 @@ def test_without_resume_nothing_is_left_and_nothing_is_reused(toy, tmp_path, und
 @pytest.mark.parametrize("damage", ["flip", "cut", "grow", "remove", "tear"])
 def test_bytes_that_a_crash_damaged_are_made_again(toy, tmp_path, undisturbed, damage):
     plan = plan_for(toy, *outputs(tmp_path))
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         bake(plan, toy, stop_after(SIZE[2]), resume=True)
     for folder in tmp_path.glob(".*.baking"):
         name = "journal.*" if damage == "tear" else "[a-z]*[.0-9][0-9][0-9][0-9]*"
@@ -129,7 +129,7 @@ def test_a_missing_shard_is_named(toy, tmp_path):
 
 
 def test_work_of_another_plan_is_never_reused_silently(toy, tmp_path):
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         bake(plan_for(toy, *outputs(tmp_path, ("a.vti",))), toy, stop_after(16), resume=True)
     for changes in ({"size": (7, 5, 20)}, {"samples": 8}, {"tile": "x"}):
         with pytest.raises(BakeError, match=r"a\.vti: an unfinished bake of another plan.*different: "):
@@ -187,11 +187,11 @@ def test_a_kill_between_two_renames_leaves_the_rest_to_be_done(toy, tmp_path, un
         nonlocal count
         count += Path(target).parent == tmp_path
         if count > finals and Path(target).parent == tmp_path:
-            raise Stop
+            raise StopError
         replaced(source, target)
 
     monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         bake(plan, toy, resume=True)
     monkeypatch.undo()
     bake(plan, toy, resume=True)
@@ -305,3 +305,40 @@ def test_resume_update_and_shards_on_the_command_line(solidgrain, tmp_path, toy_
     assert contents(tmp_path) == first
     assert solidgrain("bake", toy_folder, "--size", "6x5x41", "--out", "a.npy", "--update").code == 0
     assert (tmp_path / "a.npy").stat().st_size == 128 + 6 * 5 * 41 * 12
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of two megabytes."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", folder], capture_output=True, check=False)
+    if mounted.returncode:
+        pytest.skip(f"cannot mount a small file system: {mounted.stderr.decode().strip()}")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+@pytest.mark.parametrize(
+    "name", ["a.####.exr", "a.vti", "z.vti", "a.npy", "x.####.exr", "m.npy", "a.vdb", "a.dds", "a.atlas.png", "a.png"]
+)
+def test_a_disk_that_fills_up_leaves_a_bake_to_resume(toy, small_disk, tmp_path, name):
+    size = (48, 40, 20)
+    undisturbed, filler = tmp_path / "undisturbed", small_disk / "filler"
+    undisturbed.mkdir()
+    bake(plan_for(toy, *outputs(undisturbed, (name,)), size=size), toy)
+    plan = plan_for(toy, *outputs(small_disk, (name,)), size=size)
+    filler.write_bytes(bytes(2 * 2**20 - 60_000))
+    with pytest.raises(BakeError, match=r"No space left|cannot write") as failure:
+        bake(plan, toy, resume=True)
+    assert "\n" not in str(failure.value)
+    assert [path.name for path in small_disk.iterdir()] == [f".{name}.baking", "filler"]
+    filler.unlink()
+    bake(plan, toy, resume=True)
+    assert contents(small_disk) == contents(undisturbed)
+    for path in small_disk.iterdir():
+        path.unlink()
+    filler.write_bytes(bytes(2 * 2**20 - 60_000))
+    with pytest.raises(BakeError):
+        bake(plan, toy)
+    assert [path.name for path in small_disk.iterdir()] == ["filler"]

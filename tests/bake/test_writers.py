@@ -134,11 +134,28 @@ def test_two_bakes_are_the_same_bytes(baked, toy, tmp_path):
 
 
 def test_a_tiled_volume_meets_itself_in_the_written_files(toy, tmp_path):
-    """The step from the last voxel of the tile to its first is a step like any other, on every axis."""
-    bake(plan_for(toy, make_output(tmp_path / "tile.npy"), tile="xyz"), toy)
-    tile = np.load(tmp_path / "tile.npy")
+    """The step from the last voxel of the tile to its first is a step like any other, on every axis, in every format."""
+    outputs = [make_output(tmp_path / "tile.npy"), make_output(tmp_path / "tile.vti"), make_output(tmp_path / "tile.####.exr")]
+    bake(plan_for(toy, *outputs, tile="xyz"), toy)
     twice = toy.grid([2 * n for n in SIZE[::-1]], seed=7, origin=ORIGIN, spacing=SPACING, tile="xyz", period=SIZE[::-1])
-    assert np.abs(twice - np.tile(tile, (2, 2, 2, 1))).max() <= 1e-4
+    stack = [oiio.ImageBuf(os.fspath(tmp_path / f"tile.{z + 1:04d}.exr")).get_pixels(oiio.FLOAT) for z in range(SIZE[2])]
+    volume = pyvista.read(tmp_path / "tile.vti").point_data["rgb"].reshape(*SIZE[::-1], 3) / 255
+    for tile, expected, tolerance in (
+        (np.load(tmp_path / "tile.npy"), twice, 1e-4),
+        (volume, twice, 0.5 / 255 + 1e-4),
+        (np.stack(stack), to_linear(twice), 6e-4),
+    ):
+        assert np.abs(expected - np.tile(tile, (2, 2, 2, 1))).max() <= tolerance
+
+
+def test_the_preview_of_a_tile_shows_its_repeats(toy, tmp_path):
+    bake(plan_for(toy, make_output(tmp_path / "a.png", PREVIEW), tile="xy", size=(16, 16, 32)), toy)
+    picture = oiio.ImageBuf(os.fspath(tmp_path / "a.png")).get_pixels(oiio.FLOAT)
+    panels = [picture[:, start : start + 384] for start in (0, 396, 792)]
+    across_z, across_y = panels[0], panels[1]
+    assert np.array_equal(across_z[:192, :192], across_z[192:, 192:])
+    assert np.array_equal(across_y[:, :192], across_y[:, 192:])
+    assert not np.array_equal(across_y[:192], across_y[192:])
 
 
 def test_a_nan_leaves_nothing_behind(toy, tmp_path, monkeypatch):

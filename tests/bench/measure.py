@@ -178,6 +178,7 @@ def bake(source: str | Path, size: str, suffixes: tuple[str, ...], *options: str
         outputs = [word for suffix in suffixes for word in ("--out", f"{folder}/a{suffix}")]
         command = [*CLI, "bake", str(source), "--size", size, "--json", "--quiet", *options, *outputs]
         report: dict[str, float] = json.loads(run(command))
+        report["bytes"] = sum(path.stat().st_size for path in Path(folder).iterdir())
         return report
 
 
