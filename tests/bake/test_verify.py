@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
+from solidgrain.bake.cli import main
 from solidgrain.export.bundle import Details, write_bundle
 from tests.toy import toy_weights
 
@@ -21,12 +23,19 @@ OUTPUTS = {
 }
 
 
-@pytest.fixture
-def files(solidgrain, tmp_path, toy_folder, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def baked(tmp_path_factory, toy_folder):
+    folder = tmp_path_factory.mktemp("baked")
     for name, flags in OUTPUTS.items():
-        assert solidgrain("bake", toy_folder, *FLAGS, "--out", name, *flags, "--quiet").code == 0
-    return tmp_path
+        assert main([str(word) for word in ("bake", toy_folder, *FLAGS, "--out", folder / name, *flags, "--quiet")]) == 0
+    return folder
+
+
+@pytest.fixture
+def files(baked, tmp_path, monkeypatch):
+    folder = shutil.copytree(baked, tmp_path / "files")
+    monkeypatch.chdir(folder)
+    return folder
 
 
 def test_what_was_baked_is_sound_wherever_it_lies(solidgrain, files, tmp_path_factory):
