@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 WHEEL_VENV := build/wheel-venv
 
-.PHONY: install check test test-slow wheel test-wheel sanitize bench bench-bake pictures clean
+.PHONY: install check test test-slow wheel test-wheel sanitize bench bench-bake paper-table ground-truth pictures clean
 
 install: $(VENV)/installed
 
@@ -58,6 +58,14 @@ bench: install
 
 bench-bake: install
 	$(BIN)/python -m tests.bench.bakes --large
+
+# Hours unattended, and again after a kill: finished cells are kept (docs/training.md says how long they take).
+MINUTES ?= 20
+paper-table: install
+	$(BIN)/python -m tests.bench.paper_table --minutes $(MINUTES) --resume
+
+ground-truth: install
+	$(BIN)/python -m tests.bench.ground_truth --minutes $(MINUTES) --resume
 
 pictures: install
 	$(BIN)/python docs/pictures.py

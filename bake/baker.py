@@ -7,15 +7,18 @@ stagings hold; a shard stops after its slabs, and `merge` does the rest.
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from solidgrain.bake.evaluate import evaluate
-from solidgrain.bake.manifest import manifest_path, write_manifest
+from solidgrain.bake.manifest import forget_manifest, place_manifest, remove_stale, stage_manifest
 from solidgrain.bake.plan import Plan
 from solidgrain.bake.staging import Staging, open_staging
 from solidgrain.bake.writers import FloatArray, Output, Writer, open_writer
@@ -24,6 +27,7 @@ from solidgrain.runtime.errors import BakeError
 from solidgrain.runtime.workers import Workers
 
 OnSlice = Callable[[int, int], None]  # slices done, slices in all
+Notes = list[dict[str, Any]]  # of complete files: see `Staging.finish`
 Shard = tuple[int, int]  # slices first .. stop - 1
 
 
@@ -46,9 +50,9 @@ class Job:
     staging: Staging
 
     @property
-    def done(self) -> set[int]:
-        """The first slices of its slabs that are written."""
-        return {record.z for record in self.staging.records}
+    def done(self) -> dict[int, int]:
+        """The slabs that are written: first slice and number of slices."""
+        return {record.z: record.slices for record in self.staging.records}
 
 
 def bake(
@@ -65,15 +69,19 @@ def bake(
     otherwise nothing is left behind. A `shard` bakes slices first .. stop - 1 and leaves the rest to others and to `merge`.
     Raises BakeError if a file cannot be written or another process is baking it, EvaluationError if the texture returns NaN.
     """
-    started, workers = time.monotonic(), texture.workers.share()
-    evaluation, reused = 0.0, plan.size[2]
+    started, workers, evaluation = time.monotonic(), texture.workers.share(), 0.0
+    first, stop = shard or (0, plan.size[2])
+    if first == stop:
+        return Baked([], 0.0)  # there are more shards than slabs
     with _jobs(plan, workers, shard, keep=resume or shard is not None) as jobs:
-        if not all(job.staging.finished() for job in jobs):
+        finished = _finished(jobs)
+        reused = stop - first
+        if finished is None:
             for job in jobs:
                 job.staging.restore()
-            reused = min((job.staging.slices for job in jobs), default=0)
-            evaluation = _feed(plan, texture, jobs, workers, shard or (0, plan.size[2]), on_slice)
-        files = _complete(plan, jobs) if shard is None else []
+            reused = min(sum(slices for z, slices in job.done.items() if first <= z < stop) for job in jobs)
+            evaluation = _feed(plan, texture, jobs, workers, (first, stop), on_slice)
+        files = [] if shard else _put_in_place(plan, jobs, finished or _finish(jobs))
     return Baked(files, time.monotonic() - started, evaluation, reused)
 
 
@@ -81,13 +89,14 @@ def merge(plan: Plan, workers: Workers) -> Baked:
     """Complete a plan whose shards have all been baked. Raises BakeError that names the slices that are missing."""
     started = time.monotonic()
     with _jobs(plan, workers, None, keep=True) as jobs:
-        if not all(job.staging.finished() for job in jobs):
+        finished = _finished(jobs)
+        if finished is None:
             for job in jobs:
-                job.staging.gather()
+                job.staging.restore()
                 if gaps := job.staging.missing():
                     runs = ", ".join(f"{first} to {stop - 1}" for first, stop in gaps)
                     raise BakeError(f"{job.output.path}: slices {runs} are missing or damaged; bake their shards first")
-        files = _complete(plan, jobs)
+        files = _put_in_place(plan, jobs, finished or _finish(jobs))
     return Baked(files, time.monotonic() - started, reused_slices=plan.size[2])
 
 
@@ -105,8 +114,8 @@ def _jobs(plan: Plan, workers: Workers, shard: Shard | None, keep: bool) -> Iter
             jobs.append(Job(output, writer, staging))
         yield jobs
     except BaseException as error:
-        if not keep:
-            for job in jobs:
+        for job in jobs:
+            if not keep and not job.staging.in_place:
                 job.staging.clear()
         if isinstance(error, OSError):
             culprit = _culprit(error, plan)
@@ -122,16 +131,51 @@ def _culprit(error: OSError, plan: Plan) -> str:
     return str(error.filename2 or error.filename or ", ".join(str(output.path) for output in plan.outputs))
 
 
-def _complete(plan: Plan, jobs: Sequence[Job]) -> list[Path]:
-    """Assemble all files, then put them in place. A kill at any point leaves the next bake with the rest of it to do."""
-    finished = [job.staging.finished() or job.staging.finish(job.writer.assemble(job.staging)) for job in jobs]
+def _finished(jobs: Sequence[Job]) -> list[Notes] | None:
+    """The complete files of all outputs, if an earlier bake came so far."""
+    notes = [job.staging.finished() for job in jobs]
+    found = [lines for lines in notes if lines is not None]
+    return found if jobs and len(found) == len(notes) else None
+
+
+def _finish(jobs: Sequence[Job]) -> list[Notes]:
+    """Assemble the files of all outputs. From here on, a killed bake has only to put them in place."""
+    return [job.staging.finish(job.writer.assemble(job.staging)) for job in jobs]
+
+
+def _put_in_place(plan: Plan, jobs: Sequence[Job], finished: Sequence[Notes]) -> list[Path]:
+    """Give all files their names. An interrupt waits; an error or a kill leaves the stagings for `resume`."""
     files: list[Path] = []
-    for job, lines in zip(jobs, finished, strict=True):
-        manifest_path(job.output.path).unlink(missing_ok=True)  # of files that are about to be replaced
-        files += job.staging.commit(lines)
-        write_manifest(plan, job.output, lines, job.staging.folder)
-        job.staging.clear()
+    with _uninterrupted():
+        for job, lines in zip(jobs, finished, strict=True):
+            stage_manifest(plan, job.output, lines, job.staging.folder)  # all that needs space comes before the first name
+        for job in jobs:
+            job.staging.in_place = True
+        for job, lines in zip(jobs, finished, strict=True):
+            replaced = forget_manifest(job.output)
+            files += job.staging.commit(lines)
+            place_manifest(job.output, job.staging.folder)
+            remove_stale(replaced, job.output, lines)
+            job.staging.clear()
     return files
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C and SIGTERM wait until the files are in place, if this is the thread that they interrupt."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    handlers = [signal.signal(number, lambda number, frame: waiting.append(number)) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, handlers, strict=True):
+            signal.signal(number, handler)
+        if waiting:
+            signal.raise_signal(waiting[0])
 
 
 def _feed(plan: Plan, texture: Texture, jobs: Sequence[Job], workers: Workers, shard: Shard, on_slice: OnSlice) -> float:

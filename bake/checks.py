@@ -8,36 +8,45 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from solidgrain.bake.manifest import manifest_path
+from solidgrain.bake.manifest import is_complete, manifest_path
 from solidgrain.bake.plan import Plan, format_bytes, format_size
-from solidgrain.bake.staging import staged_bytes
+from solidgrain.bake.staging import discard_staging, is_begun, staged_bytes, staging_folder
 from solidgrain.bake.writers import Output, check_output, output_bytes, output_exists, output_files, scratch_bytes
 from solidgrain.runtime.errors import BakeError, UsageError
 
 
-def check_plan(plan: Plan, overwrite: bool, begun: Sequence[Output] = ()) -> None:
+def check_plan(plan: Plan, overwrite: bool, begun: Sequence[Output] = (), shard: tuple[int, int] | None = None) -> None:
     """Refuse what cannot work, before any voxel is evaluated. Raises BakeError or UsageError with the reason.
 
-    Outputs that are `begun` may have files in place: those that a kill left behind between two renames.
+    Outputs that are `begun` may have files in place: those that a kill left behind between two renames. With `shard`, slices
+    first .. stop - 1, only their share of the disk must be free.
     """
     for output in plan.outputs:
         check_output(output, plan.volume)
         _check_folder(output.path)
     _check_memory(plan)  # before any list as long as the volume is made
-    _check_disk(plan)
+    _check_disk(plan, shard)
     taken: set[Path] = set()
     for output in plan.outputs:
         for path in output_files(output, plan.volume):
             _check_file(path, overwrite or output in begun, taken)
     for output in plan.outputs:
-        _check_name(manifest_path(output.path).absolute(), taken)
+        _check_own(output.path, taken)
 
 
 def without_existing(plan: Plan) -> Plan:
-    """The plan without the outputs of which a file exists (`--no-clobber`)."""
+    """The plan without the outputs of which a file exists (`--no-clobber`), unless a kill left the rest of them to be done."""
     _check_memory(plan)
-    kept = tuple(output for output in plan.outputs if not output_exists(output, plan.volume))
-    return replace(plan, outputs=kept)
+    kept = [output for output in plan.outputs if is_begun(output.path) or not output_exists(output, plan.volume)]
+    return replace(plan, outputs=tuple(kept))
+
+
+def without_complete(plan: Plan) -> Plan:
+    """The plan without the outputs that are whole and of this plan. What a kill left beside them is removed."""
+    complete = {output.path for output in plan.outputs if is_complete(plan, output)}
+    for path in complete:
+        discard_staging(path)
+    return replace(plan, outputs=tuple(output for output in plan.outputs if output.path not in complete))
 
 
 def _check_file(path: Path, overwrite: bool, taken: set[Path]) -> None:
@@ -49,9 +58,19 @@ def _check_file(path: Path, overwrite: bool, taken: set[Path]) -> None:
 
 
 def _check_name(path: Path, taken: set[Path]) -> None:
-    if path in taken:
+    real = path.parent.resolve() / path.name
+    if real in taken:
         raise UsageError(f"--out {path}: two outputs would write this file; give each a name of its own")
-    taken.add(path)
+    taken.add(real)
+
+
+def _check_own(output: Path, taken: set[Path]) -> None:
+    """What a bake makes beside an output: its manifest and its staging folder."""
+    manifest, staging = manifest_path(output), staging_folder(output)
+    _check_name(manifest.absolute(), taken)
+    if manifest.is_dir() or (staging.exists() and not staging.is_dir()):
+        wrong = manifest if manifest.is_dir() else staging
+        raise BakeError(f"{wrong}: is in the way of what a bake of {output.name} keeps there; move it")
 
 
 def _check_folder(path: Path) -> None:
@@ -71,13 +90,15 @@ def _check_memory(plan: Plan) -> None:
         )
 
 
-def _check_disk(plan: Plan) -> None:
+def _check_disk(plan: Plan, shard: tuple[int, int] | None) -> None:
     """The outputs' sizes per file system against its free space, less what an earlier bake has left there."""
+    share = 1.0 if shard is None else (shard[1] - shard[0]) / plan.size[2]
     needed: dict[int, tuple[Path, int]] = {}
     for output in plan.outputs:
         folder = output.path.parent
         device = folder.stat().st_dev
-        size = output_bytes(output, plan.volume) + scratch_bytes(output, plan.volume) - staged_bytes(output.path)
+        size = int(share * (output_bytes(output, plan.volume) + scratch_bytes(output, plan.volume)))
+        size -= staged_bytes(output.path) if shard is None else 0
         needed[device] = (folder, needed.get(device, (folder, 0))[1] + max(0, size))
     for folder, size in needed.values():
         free = shutil.disk_usage(folder).free

@@ -54,6 +54,19 @@ class Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line. Returns the exit code."""
     arguments = _glue_negative(list(sys.argv[1:] if argv is None else argv))
+    try:
+        return _run(arguments)
+    except KeyboardInterrupt:
+        resumes = any(word.startswith(("--resume", "--shard", "--dask")) for word in arguments)
+        left = "go on with the same flags" if resumes else "nothing half-written was left behind"
+        print(f"interrupted; {left}", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(arguments: list[str]) -> int:
+    """The command, and one line for each kind of error."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _interrupt)  # farms stop jobs with SIGTERM: clean up as for Ctrl-C
     parser, module = _parser(arguments)
     options = parser.parse_args(arguments)
     if module is None:
@@ -61,8 +74,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return USAGE
     from solidgrain.runtime.errors import SolidgrainError, UsageError  # here: they import numpy, which --help can do without
 
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, _interrupt)  # farms stop jobs with SIGTERM: clean up as for Ctrl-C
     try:
         code = int(module.run(options))
         sys.stdout.flush()
@@ -81,11 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.filename is None:  # stdout: a closed pipe, a full device
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains once more on exit
             return _fail(f"cannot print the result ({error.strerror})")
-        raise
-    except KeyboardInterrupt:
-        left = "go on with the same flags" if keeps_work(options) else "nothing half-written was left behind"
-        print(f"interrupted; {left}", file=sys.stderr)
-        return INTERRUPTED
+        return _fail(f"{error.filename}: {error.strerror}")
 
 
 def _parser(arguments: Sequence[str]) -> tuple[Parser, ModuleType | None]:
@@ -111,11 +118,6 @@ def _glue_negative(arguments: list[str]) -> list[str]:
         else:
             glued.append(word)
     return glued
-
-
-def keeps_work(options: argparse.Namespace) -> bool:
-    """Whether an interrupt leaves what was done for the next run to take up."""
-    return any(getattr(options, name, None) for name in ("resume", "shard", "dask"))
 
 
 def _fail(message: str) -> int:

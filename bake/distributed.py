@@ -60,9 +60,11 @@ def bake_on_cluster(
     """
     from solidgrain.bake.baker import Baked, merge
     from solidgrain.bake.farm import anywhere, shard_count
+    from solidgrain.bake.staging import clear_leftovers
 
     started = time.monotonic()
-    _check_leftovers(plan, overwrite)
+    for output in plan.outputs:  # here, before Dask tries a shard again and again
+        clear_leftovers(output.path, plan.work(output), overwrite)
     with _connected(cluster) as client:
         each = max(1, (threads or texture.threads) // _workers(cluster)) if cluster.startswith(LOCAL) else threads
         count = shard_count(plan, shards)
@@ -70,23 +72,6 @@ def bake_on_cluster(
     merged = merge(plan, texture.workers)
     evaluation = sum(float(one["evaluation_seconds"]) for one in told)
     return Baked(merged.files, time.monotonic() - started, evaluation, sum(one["reused_slices"] for one in told)), told
-
-
-def _check_leftovers(plan: Plan, overwrite: bool) -> None:
-    """Remove unfinished bakes of other plans that are in the way, or refuse to: here, before Dask tries a shard again."""
-    from solidgrain.bake.plan import hash_of
-    from solidgrain.bake.staging import WORK, discard_staging, read_work, staging_folder
-
-    for output in plan.outputs:
-        folder = staging_folder(output.path)
-        if not (folder / WORK).exists() or hash_of(read_work(folder / WORK)) == hash_of(plan.work(output)):
-            continue
-        if not overwrite:
-            raise BakeError(
-                f"{output.path}: an unfinished bake of another plan lies in {folder}; "
-                "finish it with its own flags, or begin anew with --overwrite"
-            )
-        discard_staging(output.path)
 
 
 def _run_shards(client: Client, plan: Plan, count: int, provider: str, threads: int, on_slice: OnSlice) -> list[dict[str, Any]]:
@@ -117,10 +102,11 @@ def bake_shard(values: dict[str, Any], number: int, count: int, provider: str, t
 
     from solidgrain.bake.baker import bake
     from solidgrain.bake.schema import plan_of
+    from solidgrain.bake.verify import check_texture
 
     plan = plan_of(values, "the plan of the Dask task")
     texture = _texture(plan.source, plan.bundle, plan.precision, provider, threads or get_worker().state.nthreads)
-    _check_texture(plan, texture)
+    check_texture(plan, texture, f"worker {socket.gethostname()}")
     shard = plan.shard(number, count)
     try:
         baked = bake(plan, texture, shard=shard)
@@ -145,12 +131,6 @@ def _texture(source: str, bundle: str | None, precision: str, provider: str, thr
     from solidgrain.runtime import load
 
     return load(source, bundle=bundle, precision=precision, provider=provider, threads=threads)
-
-
-def _check_texture(plan: Plan, texture: Texture) -> None:
-    from solidgrain.bake.verify import check_texture
-
-    check_texture(plan, texture, f"worker {socket.gethostname()}")
 
 
 def _workers(cluster: str) -> int:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
-from pathlib import Path
 
-from solidgrain.bake.plan import Plan
+from solidgrain.bake.plan import Plan, located
 
 MOST_SHARDS = 64  # by default
 
@@ -14,9 +12,7 @@ MOST_SHARDS = 64  # by default
 def anywhere(plan: Plan) -> Plan:
     """The plan with absolute paths: the same work, from any working folder."""
     outputs = tuple(replace(output, path=output.path.absolute()) for output in plan.outputs)
-    source = os.fspath(Path(plan.source).absolute()) if Path(plan.source).exists() else plan.source  # an embedded name
-    bundle = None if plan.bundle is None else os.fspath(Path(plan.bundle).absolute())
-    return replace(plan, outputs=outputs, source=source, bundle=bundle)
+    return replace(plan, outputs=outputs, source=located(plan.source), bundle=plan.bundle and located(plan.bundle))
 
 
 def shard_count(plan: Plan, asked: int | None) -> int:

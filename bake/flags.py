@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from solidgrain.bake.writers import Output
     from solidgrain.runtime import Texture
 
-ENGINES = ("unreal", "unity", "godot")
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
@@ -56,6 +54,8 @@ def _add_grid(group: argparse._ArgumentGroup) -> None:
 
 
 def _add_outputs(group: argparse._ArgumentGroup) -> None:
+    from solidgrain.bake.engines import ENGINES
+
     add = group.add_argument
     add("--out", type=Path, action="append", default=[], metavar="FILE", help="granite.####.exr, .vti, .vdb, …; repeatable")
     add("--preview", type=Path, metavar="FILE.png", help="a PNG with three slices and the turned block")
@@ -63,7 +63,7 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
     add("--dither", action="store_true", help="triangular dither before rounding to whole numbers, a function of the voxel")
     add("--mips", action="store_true", help="write the mip chain too, filtered in linear light")
     add("--mip-filter", choices=("box", "kaiser"), help="kaiser is sharper (box)")
-    add("--for", dest="engine", choices=ENGINES, help="axis order, layout and limits of a game engine")
+    add("--for", dest="engine", choices=tuple(ENGINES), help="axis order, layout and limits of a game engine")
 
 
 def _add_formats(group: argparse._ArgumentGroup) -> None:
@@ -91,8 +91,8 @@ def _add_work(group: argparse._ArgumentGroup) -> None:
     existing = group.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace outputs that exist")
     existing.add_argument("--no-clobber", action="store_true", help="skip outputs that exist")
-    existing.add_argument("--resume", action="store_true", help="go on where a bake of the same plan was stopped")
     existing.add_argument("--update", action="store_true", help="bake only what is not there, whole and of this plan")
+    add("--resume", action="store_true", help="go on where a bake of the same plan was stopped")
     add("--shard", type=parse_shard, metavar="I/N", help="bake share I of N; solidgrain merge completes the files")
     add("--plan", type=Path, metavar="FILE", help="bake a plan that was saved: a .bake.json, or what --dry-run --json printed")
     add("--jobs", type=Path, metavar="FILE", help="bake all that a job file lists, .json or .toml")
@@ -106,12 +106,14 @@ def _add_work(group: argparse._ArgumentGroup) -> None:
 
 def make_plan(arguments: argparse.Namespace, texture: Texture) -> Plan:
     """The plan that the flags ask for. Raises UsageError when they contradict each other."""
-    from solidgrain.bake.plan import Plan
+    from solidgrain.bake.evaluate import check_place
+    from solidgrain.bake.plan import Plan, located
 
     size = arguments.size or (128, 128, 128)
     origin, spacing = _placement(arguments, size)
-    return Plan(
-        source=arguments.source or "granite",
+    source = arguments.source or "granite"
+    plan = Plan(
+        source=located(source),
         texture=texture.name,
         texture_sha256=texture.data.sha256,
         sampler_sha256=texture.data.sampler_sha256,
@@ -124,14 +126,17 @@ def make_plan(arguments: argparse.Namespace, texture: Texture) -> Plan:
         outputs=tuple(make_outputs(arguments)),
         transform=arguments.transform,
         samples=arguments.samples or 1,
-        bundle=arguments.bundle,
+        bundle=arguments.bundle and located(arguments.bundle),
     )
+    check_place(plan, texture)
+    return plan
 
 
 def make_outputs(arguments: argparse.Namespace) -> list[Output]:
     """The files that the flags name, with the settings of their formats."""
     from solidgrain.bake.writers import PREVIEW, formats, kind_of, make_output
 
+    _check_uses(arguments)
     outputs = []
     for path in arguments.out:
         kind = kind_of(path)
@@ -144,6 +149,22 @@ def make_outputs(arguments: argparse.Namespace) -> list[Output]:
             raise UsageError(f"--preview {arguments.preview}: expected a name that ends in .png")
         outputs.append(make_output(arguments.preview, PREVIEW))
     return outputs
+
+
+def _check_uses(arguments: argparse.Namespace) -> None:
+    """Refuse flags that are about no output. Raises UsageError."""
+    from solidgrain.bake.writers import formats, kind_of
+
+    written = {formats()[kind_of(path)].name for path in arguments.out}
+    for row in formats().values():
+        for option in row.options:
+            if row.name not in written and getattr(arguments, f"{row.name}_{option.name}".replace("-", "_")) is not None:
+                raise UsageError(f"--{row.name}-{option.name}: no --out of this format; leave it out")
+    for name, flag in (("mips", "--mips"), ("colorspace", "--colorspace"), ("engine", "--for"), ("dither", "--dither")):
+        if not written and getattr(arguments, name):
+            raise UsageError(f"{flag}: the preview has no use for it, and there is no --out; leave it out")
+    if arguments.colorspace == "":
+        raise UsageError("--colorspace: expected a name, found nothing")
 
 
 def _shared_options(arguments: argparse.Namespace, kind: str) -> dict[str, str | int]:

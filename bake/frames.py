@@ -7,7 +7,7 @@ from pathlib import Path
 
 from solidgrain.runtime.errors import UsageError
 
-PATTERN = re.compile(r"(?P<hashes>#+)|%0(?P<digits>\d+)d")
+PATTERN = re.compile(r"(?P<hashes>#+)|%0(?P<digits>\d\d?)d")
 
 
 def frame_paths(pattern: Path, count: int, first: int) -> list[Path]:
@@ -20,7 +20,7 @@ def frame_paths(pattern: Path, count: int, first: int) -> list[Path]:
     if not matches and count == 1:
         return [pattern]
     if len(matches) != 1:
-        example = f"{pattern.stem.rstrip('.')}.####{pattern.suffix}"
+        example = f"{re.sub('[#%]+0?[0-9]*d?', '', pattern.stem).rstrip('.')}.####{pattern.suffix}"
         raise UsageError(f"--out {pattern}: expected one frame pattern for its {count} slices, such as {example}")
     match = matches[0]
     asked = len(match["hashes"]) if match["hashes"] else int(match["digits"])

@@ -221,6 +221,8 @@ def _bake_job(one: Planned, texture: Texture, bake: Bake) -> dict[str, Any]:
         result = bake(one.plan, texture, one.job.arguments)
     except SolidgrainError as error:
         return _line(one, FAILED, error=f"{one.job.where}: {error}")
+    except Exception as error:  # whatever it is, it must not cost the other jobs
+        return _line(one, FAILED, error=f"{one.job.where}: {type(error).__name__}: {error}")
     return _line(one, DONE, seconds=result["seconds"], files=result["files"])
 
 

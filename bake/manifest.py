@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-from solidgrain.bake.frames import PATTERN
 from solidgrain.bake.plan import Plan, hash_of
 from solidgrain.bake.store import sha256_of
 from solidgrain.bake.writers import Output
@@ -15,30 +14,52 @@ from solidgrain.runtime.errors import BakeError
 from solidgrain.runtime.files import replacing
 
 SUFFIX = ".bake.json"
+STAGED = "manifest.json"
 
 
 def manifest_path(output: Path) -> Path:
-    """`a.vti` -> `a.vti.bake.json`, `a.####.exr` -> `a.exr.bake.json`."""
-    name = PATTERN.sub("", output.name, count=1).replace("..", ".").lstrip(".")
-    return output.with_name(f"{name}{SUFFIX}")
+    """`a.vti` -> `a.vti.bake.json`: a manifest of its own for every output."""
+    return output.with_name(f"{output.name}{SUFFIX}")
 
 
-def write_manifest(plan: Plan, output: Output, files: list[dict[str, Any]], staging: Path) -> Path:
-    """Say that an output is complete. `files` have a name ("final"), "bytes" and "sha256".
-
-    It is written in the staging folder, which a kill leaves to the next bake, and then put in place.
-    """
+def stage_manifest(plan: Plan, output: Output, files: list[dict[str, Any]], staging: Path) -> None:
+    """Write, in the staging folder, that an output is complete. `files` have a name ("final"), "bytes" and "sha256"."""
     values = {
         "plan": plan.to_json(),
         "output": output.path.name,
         "work": hash_of(plan.work(output)),
         "files": {file["final"]: {"bytes": file["bytes"], "sha256": file["sha256"]} for file in files},
     }
-    path, staged = manifest_path(output.path), staging / "manifest.json"
-    with replacing(staged) as file:
+    with replacing(staging / STAGED) as file:
         file.write(json.dumps(values, indent=1).encode() + b"\n")
-    os.replace(staged, path)
-    return path
+
+
+def place_manifest(output: Output, staging: Path) -> None:
+    """Put it beside its files, which are all in place."""
+    os.replace(staging / STAGED, manifest_path(output.path))
+
+
+def forget_manifest(output: Output) -> dict[str, Any]:
+    """Remove the manifest of files that are about to be replaced. Returns its `files`, none if it is not one of ours."""
+    path = manifest_path(output.path)
+    try:
+        manifest = read_manifest(path)
+    except BakeError:
+        manifest = {"output": "", "files": {}}
+    path.unlink(missing_ok=True)
+    files: dict[str, Any] = manifest["files"]
+    return files if manifest["output"] == output.path.name else {}
+
+
+def remove_stale(replaced: dict[str, Any], output: Output, files: list[dict[str, Any]]) -> None:
+    """Remove what a replaced bake has left besides the new files, such as the last slices of a deeper stack.
+
+    Only files that are still what was baked then.
+    """
+    for name in set(replaced) - {file["final"] for file in files}:
+        path = output.path.parent / name
+        if path.is_file() and sha256_of(path) == replaced[name]["sha256"]:
+            path.unlink()
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
@@ -47,11 +68,21 @@ def read_manifest(path: Path) -> dict[str, Any]:
         values = json.loads(path.read_bytes())
     except OSError as error:
         raise BakeError(f"{path}: cannot read the manifest ({error.strerror})") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BakeError(f"{path}: not JSON ({error}); bake again with --overwrite") from error
-    if not isinstance(values, dict) or not {"plan", "output", "work", "files"} <= set(values):
+    if not isinstance(values, dict) or not {"plan", "output", "work", "files"} <= set(values) or not _lists_files(values):
         raise BakeError(f"{path}: not a manifest of solidgrain bake; expected plan, output, work and files")
     return values
+
+
+def _lists_files(values: dict[str, Any]) -> bool:
+    files = values["files"]
+    if not isinstance(values["output"], str) or not isinstance(files, dict) or not files:
+        return False
+    return all(
+        isinstance(file, dict) and isinstance(file.get("bytes"), int) and isinstance(file.get("sha256"), str)
+        for file in files.values()
+    )
 
 
 def damaged_files(manifest: dict[str, Any], folder: Path) -> list[str]:
@@ -59,12 +90,15 @@ def damaged_files(manifest: dict[str, Any], folder: Path) -> list[str]:
     wrong = []
     for name, expected in manifest["files"].items():
         path = folder / name
-        if not path.is_file():
-            wrong.append(f"{path}: missing")
-        elif path.stat().st_size != expected["bytes"]:
-            wrong.append(f"{path}: {path.stat().st_size} bytes, expected {expected['bytes']}")
-        elif sha256_of(path) != expected["sha256"]:
-            wrong.append(f"{path}: its checksum is not the one that was written")
+        try:
+            if not path.is_file():
+                wrong.append(f"{path}: missing")
+            elif path.stat().st_size != expected["bytes"]:
+                wrong.append(f"{path}: {path.stat().st_size} bytes, expected {expected['bytes']}")
+            elif sha256_of(path) != expected["sha256"]:
+                wrong.append(f"{path}: its checksum is not the one that was written")
+        except OSError as error:
+            wrong.append(f"{path}: cannot read it ({error.strerror})")
     return wrong
 
 

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from solidgrain.bake.writers import Output, Volume
+from solidgrain.runtime.bundle import MANIFEST
 
 SLAB_BYTES = 48 * 2**20  # of float32 colour; what a bake holds at a time is a small multiple of it
 THICKEST_SLAB = 16  # slices
 BASE_MEMORY = 220 * 2**20  # interpreter, libraries, noise tables, the chunks in flight
 FORMAT_VERSION = 1  # of plans and manifests
+BYTES_VERSION = 1  # of what writers make of a plan: one more with every change of it
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -76,7 +78,7 @@ class Plan:
         values = self.to_json()
         for key in ("hash", "outputs", "source", "bundle"):
             del values[key]
-        return {**values, "output": {**asdict(output), "path": output.path.name}}
+        return {**values, "slab": self.slab, "bytes": BYTES_VERSION, "output": {**asdict(output), "path": output.path.name}}
 
     def to_json(self) -> dict[str, Any]:
         """The plan as plain data, with the hash that names the work."""
@@ -93,6 +95,12 @@ def plan_from_json(values: dict[str, Any]) -> Plan:
     if rest.get("transform"):
         rest["transform"] = tuple(tuple(row) for row in rest["transform"])
     return Plan(outputs=tuple(outputs), **rest)
+
+
+def located(source: str) -> str:
+    """Where a texture or bundle is, from any working folder; an embedded name as it is."""
+    path = Path(source)
+    return str(path.absolute()) if path.is_file() or (path / MANIFEST).is_file() else source
 
 
 def hash_of(values: dict[str, Any]) -> str:

@@ -84,7 +84,9 @@ def read_data(path: Path) -> Any:
         content = path.read_bytes()
         if path.suffix.lower() == ".toml":
             return tomllib.loads(content.decode())
-        return json.loads(content, parse_constant=_refuse_constant, object_pairs_hook=_without_repeats)
+        values = json.loads(content, parse_constant=_refuse_constant, object_pairs_hook=_without_repeats)
+        json.dumps(values, ensure_ascii=False).encode(errors="surrogateescape")  # refuses what no file name can have
+        return values
     except OSError as error:
         raise UsageError(f"{path}: cannot read it ({error.strerror})") from error
     except (ValueError, RecursionError) as error:

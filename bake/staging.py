@@ -19,6 +19,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from solidgrain.bake.plan import hash_of
 from solidgrain.bake.store import Encoded, Finished, Record, Span, Store, sha256_of
 from solidgrain.runtime.errors import BakeError
 from solidgrain.runtime.files import replacing
@@ -29,24 +30,27 @@ LOCK, WORK, FINISHED, JOURNAL = "lock", "work.json", "finished.json", "journal"
 class Staging(Store):
     """The store of one output. Opened with `open_staging`, closed with `close`; `clear` removes it."""
 
-    def __init__(self, folder: Path, depth: int, reserved: int, first: int, locks: list[BinaryIO]) -> None:
-        super().__init__(folder, depth, reserved, first)
+    def __init__(
+        self, folder: Path, work: str, depth: int, reserved: int, shard: tuple[int, int] | None, locks: list[BinaryIO]
+    ) -> None:
+        super().__init__(folder, depth, reserved, shard[0] if shard else 0)
+        self.work = work  # hash of what the bytes depend on
+        self.shared = shard is not None
+        self.in_place = False  # files have begun to get their names
         self._locks = locks
-        self._journal = folder / f"{JOURNAL}.{first:09d}"
+        self._journal = folder / f"{JOURNAL}.{self.first:09d}"
 
     def append(self, z: int, slices: int, encoded: Encoded) -> Record:
         record = super().append(z, slices, encoded)
         with open(self._journal, "ab") as file:
-            file.write(_line(record))
+            file.write(self._line(record))
         return record
 
-    @property
-    def slices(self) -> int:
-        """How many slices are written."""
-        return sum(record.slices for record in self.records)
-
     def restore(self) -> None:
-        """Take up what this shard's journal tells and its files confirm; forget the rest, on disk too."""
+        """Take up what this shard's journal tells and its files confirm; forget the rest, on disk too.
+
+        Who has all of the staging takes up what other shards have left.
+        """
         (self.folder / FINISHED).unlink(missing_ok=True)
         self.records = self._confirmed(self._journal)
         ends: dict[str, int] = {}
@@ -56,18 +60,25 @@ class Staging(Store):
             if path != self._journal and path.name.partition(".")[0] != LOCK:
                 os.truncate(path, ends.get(path.name, 0))
         with replacing(self._journal) as file:
-            file.writelines(_line(record) for record in self.records)
+            file.writelines(map(self._line, self.records))
+        if not self.shared:
+            self.gather()
 
     def gather(self) -> None:
-        """Take up what all shards' journals tell and their files confirm."""
-        journals = sorted(self.folder.glob(f"{JOURNAL}.*"))
-        self.records = [record for journal in journals for record in self._confirmed(journal)]
+        """Take up what the other shards' journals tell and their files confirm, too."""
+        for journal in sorted(self.folder.glob(f"{JOURNAL}.*")):
+            if journal != self._journal:
+                self.records += self._confirmed(journal)
+
+    def _line(self, record: Record) -> bytes:
+        values = {"work": self.work, "z": record.z, "slices": record.slices}
+        return json.dumps({**values, "streams": dict(record.streams), "files": dict(record.files)}).encode() + b"\n"
 
     def _confirmed(self, journal: Path) -> list[Record]:
         """A stream's records up to the first bad one: later bytes lie behind it. Files stand for themselves."""
         found: list[Record] = []
         ends: dict[str, int] = {}
-        for record in _records(journal):
+        for record in _records(journal, self.work):
             follows = all(span.offset == ends.get(span.file, self._start(span.file)) for span in record.streams.values())
             whole = all(self.intact(span, alone=True) for span in record.files.values())
             if not (follows and whole and all(map(self.intact, record.streams.values()))):
@@ -94,16 +105,17 @@ class Staging(Store):
             for file in files
         ]
         with replacing(self.folder / FINISHED) as file:
-            file.write(json.dumps(lines).encode())
+            file.write(json.dumps({"work": self.work, "files": lines}).encode())
         return lines
 
     def finished(self) -> list[dict[str, Any]] | None:
         """The complete files, if `finish` came to its end and nothing has been lost since."""
         try:
-            lines: list[dict[str, Any]] = json.loads((self.folder / FINISHED).read_bytes())
+            notes = json.loads((self.folder / FINISHED).read_bytes())
         except (OSError, ValueError):
             return None
-        return lines if all(self._found(line) for line in lines) else None
+        lines: list[dict[str, Any]] = notes["files"]
+        return lines if notes["work"] == self.work and all(map(self._found, lines)) else None
 
     def _found(self, line: dict[str, Any]) -> bool:
         """Whether a complete file lies here, or already where it belongs."""
@@ -127,15 +139,27 @@ class Staging(Store):
         for lock in self._locks:
             lock.close()
 
-    def clear(self) -> None:
-        """Remove the folder, the lock last: whoever waits for it finds a folder that is gone, and begins a new one."""
-        for path in sorted(self.folder.glob("*"), key=lambda path: path.name.startswith(LOCK)):
+    def empty(self) -> None:
+        """Remove everything but the locks: first what tells of bytes, last whose they are. A kill leaves nothing to believe."""
+        for path in sorted(self.folder.glob("*"), key=_removal):
             if path.is_dir():
                 Store(path, 0).clear()
-            else:
+            elif path.name.partition(".")[0] != LOCK:
                 path.unlink(missing_ok=True)
+
+    def clear(self) -> None:
+        """Remove the folder, the lock last: whoever waits for it finds a folder that is gone, and begins a new one."""
         with suppress(OSError):
+            self.empty()
+            for path in sorted(self.folder.glob("*"), key=lambda path: path.name == LOCK):
+                path.unlink(missing_ok=True)
             self.folder.rmdir()
+
+
+def _removal(path: Path) -> int:
+    if path.name == FINISHED or path.name.startswith(f"{JOURNAL}."):
+        return 0
+    return 2 if path.name == WORK else 1
 
 
 def staging_folder(output: Path) -> Path:
@@ -143,21 +167,34 @@ def staging_folder(output: Path) -> Path:
 
 
 def is_begun(output: Path) -> bool:
-    """Whether an earlier bake of an output was killed while it put its files in place."""
+    """Whether an earlier bake of an output was killed when its files were complete: some may be in place."""
     return (staging_folder(output) / FINISHED).exists()
 
 
 def staged_bytes(output: Path) -> int:
     """The bytes that an earlier bake has left in the staging of an output."""
-    return sum(path.stat().st_size for path in staging_folder(output).glob("*") if path.is_file())
+    total = 0
+    for path in staging_folder(output).glob("*"):
+        with suppress(FileNotFoundError):  # another shard's temporary file
+            total += path.stat().st_size
+    return total
 
 
 def discard_staging(output: Path) -> None:
-    """Remove what a kill has left of a bake whose files are all in place, unless another process works there."""
+    """Remove what a kill has left of an output, unless another process works there."""
     folder = staging_folder(output)
     if folder.is_dir():
-        with suppress(BakeError), closing(Staging(folder, 0, 0, 0, _lock(folder, output, None))) as staging:
+        with suppress(BakeError), closing(Staging(folder, "", 0, 0, None, _lock(folder, output, None))) as staging:
             staging.clear()
+
+
+def clear_leftovers(output: Path, work: dict[str, Any], overwrite: bool) -> None:
+    """Remove an unfinished bake of another plan that is in the way of shards, or refuse to. Raises BakeError."""
+    path = staging_folder(output) / WORK
+    if path.exists() and overwrite and read_work(path) != json.loads(json.dumps(work)):
+        discard_staging(output)
+    elif path.exists():
+        check_work(output, work)
 
 
 def open_staging(
@@ -169,14 +206,11 @@ def open_staging(
     belongs to another plan.
     """
     folder = staging_folder(output)
-    locks = _lock(folder, output, shard)
-    staging = Staging(folder, depth, reserved, shard[0] if shard else 0, locks)
+    staging = Staging(folder, hash_of(work), depth, reserved, shard, _lock(folder, output, shard))
     try:
-        if fresh and shard is None:
-            for path in folder.iterdir():
-                if path.name != LOCK:
-                    Store(path, 0).clear() if path.is_dir() else path.unlink()
-        _check_work(folder / WORK, output, work)
+        if fresh:
+            staging.empty()
+        check_work(output, work)
     except BaseException:
         staging.close()
         raise
@@ -214,15 +248,15 @@ def _locked(folder: Path, name: str, output: Path, kind: int) -> BinaryIO:
         file.close()
 
 
-def _check_work(path: Path, output: Path, work: dict[str, Any]) -> None:
-    """The staging must be for this work. A new one is given its name."""
-    content = json.dumps(work, sort_keys=True, indent=1).encode()
+def check_work(output: Path, work: dict[str, Any]) -> None:
+    """The staging of an output must be for this work; a new one is given its name. Raises BakeError."""
+    path, expected = staging_folder(output) / WORK, json.loads(json.dumps(work))
     if not path.exists():
         with replacing(path) as file:
-            file.write(content)
+            file.write(json.dumps(work, sort_keys=True, indent=1).encode())
     found = read_work(path)
-    if found != json.loads(content):
-        differ = sorted(key for key in {*found, *work} if found.get(key) != json.loads(content).get(key))
+    if found != expected:
+        differ = sorted(key for key in {*found, *expected} if found.get(key) != expected.get(key))
         raise BakeError(
             f"{output}: an unfinished bake of another plan lies in {path.parent} (different: {', '.join(differ)}); "
             "finish it with its own flags, or begin anew with --overwrite"
@@ -237,13 +271,8 @@ def read_work(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {"work": "unreadable"}
 
 
-def _line(record: Record) -> bytes:
-    values = {"z": record.z, "slices": record.slices, "streams": dict(record.streams), "files": dict(record.files)}
-    return json.dumps(values).encode() + b"\n"
-
-
-def _records(journal: Path) -> list[Record]:
-    """The lines of a journal that are whole."""
+def _records(journal: Path, work: str) -> list[Record]:
+    """The lines of a journal that are whole and about this work."""
     try:
         lines = journal.read_bytes().split(b"\n")
     except FileNotFoundError:
@@ -252,6 +281,8 @@ def _records(journal: Path) -> list[Record]:
     for line in lines[:-1]:
         with suppress(ValueError, TypeError, KeyError):
             values = json.loads(line)
+            if values["work"] != work:
+                continue
             spans = [{name: Span(*span) for name, span in values[kind].items()} for kind in ("streams", "files")]
             records.append(Record(int(values["z"]), int(values["slices"]), *spans))
     return records

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from solidgrain.runtime.errors import BakeError
+
 Bytes = bytes | bytearray | memoryview  # of an array: its `data`
 COPY = 2**24  # bytes at a time
 
@@ -102,21 +104,26 @@ class Store:
         return [*gaps, (reached, self.depth)] if reached < self.depth else gaps
 
     def joined(self, stream: str) -> Path:
-        """A stream as one file: the first shard's, cut to what is recorded, with the others' bytes appended."""
+        """A stream as one file: where its bytes begin in order, that file with the others' appended; else a copy in order."""
         spans = [record.streams[stream] for record in self.ordered()]
-        base, end = spans[0].file, self.reserved
-        own = [span for span in spans if span.file == base]
-        for span in own:
-            if span.offset != end:
-                raise ValueError(f"{self.folder / base}: its slabs are not in one piece")
-            end += span.size
-        with open(self.folder / base, "r+b") as file:
+        base, end, kept = spans[0].file, self.reserved, 0
+        while kept < len(spans) and (spans[kept].file, spans[kept].offset) == (base, end):
+            end, kept = end + spans[kept].size, kept + 1
+        path = self.folder / base
+        if any(span.file == base for span in spans[kept:]):
+            path, end, kept = self.folder / f"{stream}.joined", self.reserved, 0
+        with open(path, "r+b" if kept else "w+b") as file:
             file.truncate(end)
             file.seek(end)
-            for span in spans[len(own) :]:
+            for span in spans[kept:]:
                 for content in self._pieces(span):
                     file.write(content)
-        return self.folder / base
+        return path
+
+    def read_part(self, stream: str, z: int, slice_bytes: int, offset: int, size: int) -> bytes:
+        """Some bytes of slice z of a stream in which each slice has `slice_bytes` bytes."""
+        record = next(record for record in self.records if record.z <= z < record.z + record.slices)
+        return self.read_span(record.streams[stream], (z - record.z) * slice_bytes + offset, size)
 
     def read(self, stream: str, z: int, count: int, slice_bytes: int) -> bytearray:
         """Slices z .. z + count - 1 of a stream in which each has `slice_bytes` bytes."""
@@ -129,7 +136,7 @@ class Store:
                     file.seek(span.offset + (first - record.z) * slice_bytes)
                     filled += file.readinto(memoryview(content)[(first - z) * slice_bytes : (stop - z) * slice_bytes])
         if filled != len(content):
-            raise EOFError(f"{self.folder}: stream {stream} is cut short")
+            raise BakeError(f"{self.folder}: what was baked has changed on the disk; bake again")
         return content
 
     def read_span(self, span: Span, offset: int, size: int) -> bytes:
@@ -138,7 +145,7 @@ class Store:
             file.seek(span.offset + offset)
             content = file.read(size)
         if len(content) != size:
-            raise EOFError(f"{self.folder / span.file}: cut short")
+            raise BakeError(f"{self.folder}: what was baked has changed on the disk; bake again")
         return content
 
     def intact(self, span: Span, alone: bool = False) -> bool:

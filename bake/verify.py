@@ -1,4 +1,4 @@
-"""Is a finished output what its plan says? Its files' checksums, and random voxels of it evaluated again."""
+"""Is a finished output what its plan says? Its files' checksums, and voxels drawn from it evaluated again."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from solidgrain.bake.color import from_srgb, to_linear, to_srgb
 from solidgrain.bake.manifest import SUFFIX, damaged_files, manifest_path, read_manifest
-from solidgrain.bake.plan import Plan, plan_from_json
-from solidgrain.bake.writers import FloatArray, Output, open_writer
+from solidgrain.bake.plan import Plan, hash_of
+from solidgrain.bake.schema import plan_of
+from solidgrain.bake.writers import FloatArray, Output, clips, open_writer
 from solidgrain.runtime import Texture, load
 from solidgrain.runtime.errors import BakeError
 
@@ -30,8 +31,13 @@ class Verified:
     largest: float  # difference beyond what the format rounds
 
 
-def verify(target: Path, voxels: int, provider: str = "auto", threads: int = 0) -> Verified:
-    """Check one output, named by its path or its manifest. Raises BakeError if there is nothing that could be checked."""
+def verify(
+    target: Path, voxels: int, source: str | None = None, bundle: str | None = None, provider: str = "auto", threads: int = 0
+) -> Verified:
+    """Check one output, named by its path or its manifest; `source` and `bundle` say where its texture is now, if it moved.
+
+    Raises BakeError or UsageError if there is nothing that could be checked.
+    """
     path = target if target.name.endswith(SUFFIX) else manifest_path(target)
     manifest = read_manifest(path)
     wrong = damaged_files(manifest, path.parent)
@@ -39,22 +45,27 @@ def verify(target: Path, voxels: int, provider: str = "auto", threads: int = 0) 
     compared, largest = 0, 0.0
     if voxels and not wrong:
         plan, output = _planned(manifest, path)
-        texture = load(plan.source, bundle=plan.bundle, provider=provider, precision=plan.precision, threads=threads)
+        texture = load(
+            source or plan.source,
+            bundle=bundle or plan.bundle,
+            provider=provider,
+            precision=plan.precision,
+            threads=threads,
+        )
         check_texture(plan, texture, f"{path}")
         compared, largest = compare(plan, output, texture, voxels)
-        if largest > MACHINES:
+        if not largest <= MACHINES:
             wrong.append(f"{output_path}: voxels differ from the texture by up to {largest:.4f} beyond rounding")
     return Verified(output_path, len(manifest["files"]), wrong, compared, largest)
 
 
 def _planned(manifest: dict[str, Any], path: Path) -> tuple[Plan, Output]:
     """The plan of a manifest, and its output where the manifest lies now."""
-    try:
-        plan = plan_from_json(manifest["plan"])
-        output = next(output for output in plan.outputs if output.path.name == manifest["output"])
-    except (KeyError, TypeError, ValueError, StopIteration) as error:
-        raise BakeError(f"{path}: its plan is incomplete ({error}); bake again with --overwrite") from error
-    return plan, replace(output, path=path.parent / output.path.name)
+    plan = plan_of(manifest["plan"], str(path), "plan")
+    for output in plan.outputs:
+        if output.path.name == manifest["output"] and hash_of(plan.work(output)) == manifest["work"]:
+            return plan, replace(output, path=path.parent / output.path.name)
+    raise BakeError(f"{path}: was edited, its plan is not the one of its files; bake again with --overwrite")
 
 
 def check_texture(plan: Plan, texture: Texture, where: str) -> None:
@@ -72,14 +83,16 @@ def check_texture(plan: Plan, texture: Texture, where: str) -> None:
 
 def compare(plan: Plan, output: Output, texture: Texture, count: int) -> tuple[int, float]:
     """How many voxels were compared, and the largest difference beyond what the format rounds."""
-    draw = np.random.default_rng(plan.seed)
+    draw = np.random.default_rng()
     voxels = draw.integers(0, plan.size, (min(count, plan.volume.voxels), 3))
     found = open_writer(output, plan.volume, texture.workers).probe(voxels)
     if found is None:
         return 0, 0.0
     colors, rounding = found
     expected = from_srgb(np.stack([evaluate_voxel(plan, texture, voxel) for voxel in voxels]), output.colorspace)
-    return len(voxels), max(0.0, float(np.abs(colors - expected).max()) - rounding)
+    if clips(output):
+        expected = expected.clip(0, 1)
+    return len(voxels), float(np.maximum(np.abs(colors - expected).max() - rounding, 0.0))
 
 
 def evaluate_voxel(plan: Plan, texture: Texture, voxel: npt.NDArray[np.int64]) -> FloatArray:

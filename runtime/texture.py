@@ -33,6 +33,7 @@ Vector = tuple[float, float, float]
 
 DEFAULT_TEXTURE = "granite"
 SLAB = 16  # slices per slab
+FINEST = 1e-9  # exemplar pixels: of a spacing or a transform
 FARTHEST = 2.0**36  # exemplar pixels: float64 coordinates still tell the places within a texel apart there
 LARGEST = 2**40  # voxels along an axis, threads, slices: what no machine has
 
@@ -105,6 +106,7 @@ class Texture:
         self.data, self.bundle, self.workers, self.provider_note = data, bundle, workers, provider_note
         self._engine = engine
         self._last: tuple[object, Instance] | None = None
+        self._last_tiling: tuple[object, Tiling] | None = None
 
     @property
     def name(self) -> str:
@@ -202,17 +204,8 @@ class Texture:
         low, high = (0, depth) if slices is None else _whole("slices", slices, count=2, least=0)
         if not low <= high <= depth:
             raise EvaluationError(f"slices {slices}: expected first and stop, from 0 to {depth}")
-        matrix = _affine(transform)
-        start, step = _finite("origin", origin), _spacing(spacing)
-        tiling = self.tiling(shape, spacing=spacing, tile=tile, period=period, transform=transform)
-        shift = np.linalg.solve(matrix[:3, :3], matrix[:3, 3])  # M p + t = M (p + shift)
-        start = (start[0] + shift[0], start[1] + shift[1], start[2] + shift[2])
-        ends = [start[axis] + step[axis] * count for axis, count in enumerate((columns, rows, depth))]
-        farthest = [max(abs(first), abs(last)) for first, last in zip(start, ends, strict=True)]
-        reach = max(*farthest, *(np.abs(matrix[:3, :3]) @ farthest))
-        if reach > FARTHEST:
-            raise EvaluationError(f"grid reaches {reach:g} pixels from the origin, expected at most {FARTHEST:g}")
-        tiling.check_exact((farthest[0], farthest[1], farthest[2]))
+        start = self.grid_start(shape, origin=origin, spacing=spacing, tile=tile, period=period, transform=transform)
+        step, tiling = _spacing(spacing), self.tiling(shape, spacing=spacing, tile=tile, period=period, transform=transform)
         instance = self._instance(tiling, seed)
         x, y, z = (
             tiling.wrap(start[axis] + (np.arange(count, dtype=np.float64) + 0.5) * step[axis], axis)
@@ -220,6 +213,33 @@ class Texture:
         )
         z = z[:high]
         return ((first, self._slab(instance, x, y, z[first : first + thickness])) for first in range(low, high, thickness))
+
+    def grid_start(
+        self,
+        shape: Sequence[int],
+        *,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        spacing: float | Sequence[float] = 1.0,
+        tile: str = "",
+        period: Sequence[int] | None = None,
+        transform: npt.ArrayLike | None = None,
+    ) -> Vector:
+        """The corner of a grid (x, y, z), the shift of its transform included: M p + t = M (p + start - origin).
+
+        Evaluates nothing: it raises the EvaluationError that `grid` would, at no cost.
+        """
+        depth, rows, columns = _positive("shape", shape)
+        matrix, corner, step = _affine(transform), _finite("origin", origin), _spacing(spacing)
+        shift = np.linalg.solve(matrix[:3, :3], matrix[:3, 3]).tolist()
+        start = (corner[0] + shift[0], corner[1] + shift[1], corner[2] + shift[2])
+        ends = [start[axis] + step[axis] * count for axis, count in enumerate((columns, rows, depth))]
+        farthest = [max(abs(first), abs(last)) for first, last in zip(start, ends, strict=True)]
+        reach = max(*farthest, *(np.abs(matrix[:3, :3]) @ farthest))
+        if reach > FARTHEST:
+            raise EvaluationError(f"grid reaches {reach:g} pixels from the origin, expected at most {FARTHEST:g}")
+        tiling = self.tiling(shape, spacing=spacing, tile=tile, period=period, transform=transform)
+        tiling.check_exact((farthest[0], farthest[1], farthest[2]))
+        return start
 
     def _slab(self, instance: Instance, x: DoubleArray, y: DoubleArray, z: DoubleArray) -> FloatArray:
         rgb = np.empty((len(z), len(y), len(x), 3), np.float32)
@@ -239,7 +259,12 @@ class Texture:
         voxels = _positive("period", shape if period is None else period)
         step = _spacing(spacing)
         transforms = self.transforms if transform is None else self.transforms @ _affine(transform)[:3, :3]
-        return tiled(transforms, (voxels[2] * step[0], voxels[1] * step[1], voxels[0] * step[2]), tile)
+        span = (voxels[2] * step[0], voxels[1] * step[1], voxels[0] * step[2])
+        key = (transforms.tobytes(), span, tile)
+        last = self._last_tiling  # finding lattices takes longer than a few voxels do
+        if last is None or last[0] != key:
+            last = self._last_tiling = (key, tiled(transforms, span, tile))
+        return last[1]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Save the texture alone (~25 KB); it loads wherever its bundle can be found."""
@@ -291,13 +316,14 @@ def _affine(transform: npt.ArrayLike | None) -> DoubleArray:
         matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
         raise EvaluationError("transform: expected 4x4 finite numbers with the last row 0, 0, 0, 1")
-    if abs(np.linalg.det(matrix[:3, :3])) < 1e-9 * np.abs(matrix[:3, :3]).max() ** 3:
-        raise EvaluationError("transform: its 3x3 part has no inverse, expected one that keeps space three-dimensional")
+    scales = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if scales[2] <= max(FINEST, 1e-9 * scales[0]) or scales[0] > FARTHEST:
+        raise EvaluationError("transform: its 3x3 part has no inverse or extreme scales, expected one that keeps space solid")
     return matrix
 
 
 def _spacing(spacing: float | Sequence[float]) -> Vector:
     step = _finite("spacing", (spacing,) * 3 if np.ndim(spacing) == 0 else spacing)  # type: ignore[arg-type]
-    if min(step) <= 0:
-        raise EvaluationError(f"spacing {step}: expected more than 0 exemplar pixels per voxel")
+    if min(step) < FINEST or max(step) > FARTHEST:
+        raise EvaluationError(f"spacing {step}: expected {FINEST:g} to {FARTHEST:g} exemplar pixels per voxel")
     return step

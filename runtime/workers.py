@@ -6,8 +6,11 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
+from functools import partial
+from typing import TypeVar
 
 Task = Callable[[], None]
+T = TypeVar("T")
 
 
 class Workers:
@@ -34,6 +37,16 @@ class Workers:
                     future.result()
         finally:
             wait([future for future in futures if not future.cancel()])
+
+    def map(self, function: Callable[[int], T], count: int) -> list[T]:
+        """function(0), ..., function(count - 1), several at a time, in order."""
+        found: dict[int, T] = {}
+
+        def call(k: int) -> None:
+            found[k] = function(k)
+
+        self.run([partial(call, k) for k in range(count)])
+        return [found[k] for k in range(count)]
 
     def cancel(self) -> None:
         """Skip what has not begun, for good: whoever waits in `run`, or calls it later, gets a CancelledError."""

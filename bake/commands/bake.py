@@ -20,7 +20,8 @@ __all__ = ["add_arguments", "run"]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from solidgrain.bake.report import describe, summary
+    from solidgrain.bake.baker import Baked
+    from solidgrain.bake.report import describe, result, summary
 
     check_modes(arguments)
     if arguments.jobs:
@@ -34,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(report, indent=2) if arguments.json else summary(report))
         return 0
     if not plan.outputs:
-        report = {**describe(plan, texture), "files": []}
+        report = result(plan, texture, Baked([], 0.0))
     else:
         report = emit_job(plan, arguments) if arguments.emit_openjd else bake_plan(plan, texture, arguments)
     if arguments.json:
@@ -47,6 +48,7 @@ def planned(arguments: argparse.Namespace) -> tuple[Plan, Texture]:
     if arguments.plan is None:
         texture = load_texture(arguments)
         return make_plan(arguments, texture), texture
+    from solidgrain.bake.evaluate import check_place
     from solidgrain.bake.schema import load_plan
     from solidgrain.bake.verify import check_texture
 
@@ -55,6 +57,7 @@ def planned(arguments: argparse.Namespace) -> tuple[Plan, Texture]:
     of_plan = {"source": plan.source, "bundle": plan.bundle, "precision": plan.precision}
     texture = load_texture(argparse.Namespace(**{**vars(arguments), **of_plan}))
     check_texture(plan, texture, f"--plan {arguments.plan}")
+    check_place(plan, texture)
     return plan, texture
 
 
@@ -101,19 +104,20 @@ def load_texture(arguments: argparse.Namespace) -> Texture:
 
 def to_do(plan: Plan, arguments: argparse.Namespace) -> Plan:
     """The plan without what is done already or must stay, once nothing speaks against it."""
-    from solidgrain.bake.checks import check_plan, without_existing
-    from solidgrain.bake.manifest import is_complete
-    from solidgrain.bake.staging import discard_staging, is_begun
+    from solidgrain.bake.checks import check_plan, without_complete, without_existing
+    from solidgrain.bake.staging import clear_leftovers, is_begun
 
+    anew, shared = arguments.overwrite or arguments.update, arguments.shard or arguments.dask
     if arguments.no_clobber:
         plan = without_existing(plan)
-    if arguments.resume or arguments.update or arguments.shard or arguments.dask:
-        complete = {output.path for output in plan.outputs if is_complete(plan, output)}
-        for path in complete:
-            discard_staging(path)
-        plan = replace(plan, outputs=tuple(output for output in plan.outputs if output.path not in complete))
-    begun = [output for output in plan.outputs if is_begun(output.path)] if arguments.resume or arguments.shard else []
-    check_plan(plan, arguments.overwrite or arguments.update, begun)
+    if arguments.resume or arguments.update or shared:
+        plan = without_complete(plan)
+    shard = plan.shard(*arguments.shard) if arguments.shard else None
+    goes_on = arguments.resume or arguments.no_clobber or shared
+    check_plan(plan, anew, [output for output in plan.outputs if goes_on and is_begun(output.path)], shard)
+    if shared:
+        for output in plan.outputs:
+            clear_leftovers(output.path, plan.work(output), anew)
     return plan
 
 

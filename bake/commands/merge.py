@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,8 +48,9 @@ def find_plan(target: Path) -> Plan:
         return load_plan(target)
     if (work := staging_folder(target) / WORK).exists():
         values = read_work(work)
-        output = {**values.pop("output", {}), "path": str(target)}
-        return plan_of({**values, "source": values.get("texture"), "outputs": [output]}, str(work))
+        output = {**values.get("output", {}), "path": str(target)}
+        described = {key: value for key, value in values.items() if key not in ("output", "slab", "bytes")}
+        return plan_of({**described, "source": values.get("texture"), "outputs": [output]}, str(work))
     if manifest_path(target).exists():
         return load_plan(manifest_path(target))
     raise UsageError(f"{target}: no shard of it has been baked here; expected an output with shards, or a plan file")
@@ -58,11 +58,10 @@ def find_plan(target: Path) -> Plan:
 
 def to_merge(plan: Plan, overwrite: bool) -> Plan:
     """The plan without the outputs that are whole already, once nothing speaks against the others. Raises BakeError."""
-    from solidgrain.bake.checks import check_plan
-    from solidgrain.bake.manifest import is_complete
+    from solidgrain.bake.checks import check_plan, without_complete
     from solidgrain.bake.staging import is_begun, staging_folder
 
-    plan = replace(plan, outputs=tuple(output for output in plan.outputs if not is_complete(plan, output)))
+    plan = without_complete(plan)
     check_plan(plan, overwrite, [output for output in plan.outputs if is_begun(output.path)])
     for output in plan.outputs:
         if not staging_folder(output.path).is_dir():

@@ -16,6 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("targets", nargs="+", type=Path, metavar="FILE", help="what was baked (a.vti, a.####.exr), or its .bake.json")
     add("--voxels", type=parse_count, default=256, metavar="N", help="random voxels to evaluate again; 0: checksums only (256)")
+    add("--source", metavar="SOURCE", help="the texture, if it is not where it was")
+    add("--bundle", metavar="FOLDER", help="the bundle that a texture file belongs to")
     add("--provider", default="auto", help="as for bake (auto)")
     add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
     add("--json", action="store_true", help="print one JSON object on stdout")
@@ -24,7 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.verify import verify
 
-    found = [verify(target, arguments.voxels, arguments.provider, arguments.threads) for target in arguments.targets]
+    where = {name: getattr(arguments, name) for name in ("source", "bundle", "provider", "threads")}
+    found = [verify(target, arguments.voxels, **where) for target in arguments.targets]
     if arguments.json:
         outputs = [{**asdict(one), "output": str(one.output), "sound": not one.wrong} for one in found]
         print(json.dumps({"outputs": outputs}, indent=2))

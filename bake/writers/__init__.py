@@ -4,6 +4,7 @@ from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Wri
 from solidgrain.bake.writers.table import (
     PREVIEW,
     check_output,
+    clips,
     formats,
     kind_of,
     make_output,
@@ -23,6 +24,7 @@ __all__ = [
     "Volume",
     "Writer",
     "check_output",
+    "clips",
     "formats",
     "kind_of",
     "make_output",

@@ -11,7 +11,6 @@ import hashlib
 import math
 import os
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +29,7 @@ OPTIONS = (Option("columns", 0, "tiles in a row; 0 chooses the squarest grid wit
 SLICES = "slices"  # stream: the voxels of each slice as the image holds them
 SIDE = 1_000_000  # pixels: libpng's limit, and just below that of OpenImageIO's readers
 VERSION = 1  # of the JSON file
+BAND_BYTES = 16 * 2**20  # of the image that are in memory at a time
 
 
 class Layout(NamedTuple):
@@ -54,6 +54,8 @@ def layout(output: Output, volume: Volume) -> Layout:
     number above 3 gets a square too, whose last tiles stay empty."""
     depth, height, width = volume.shape
     columns = int(output.options["columns"])
+    if volume.level:
+        columns = min(columns, depth)  # asked for the first level, which has more slices
     if not columns:
         rows = next(rows for rows in range(math.isqrt(depth), 0, -1) if depth % rows == 0)
         columns = math.isqrt(depth - 1) + 1 if rows == 1 and depth > 3 else depth // rows
@@ -68,15 +70,12 @@ class AtlasFile(Writer):
         return np.dtype(np.uint8 if self.output.kind.endswith("png") else np.float16)
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
-        converted: list[Bytes] = [b""] * len(slab)
-
-        def convert(k: int) -> None:
+        def convert(k: int) -> Bytes:
             level = slab[k : k + 1]
             values = self.quantized(level, z + k, np.uint8) if self.dtype == np.uint8 else self.colors(level)
-            converted[k] = np.ascontiguousarray(values, self.dtype).data
+            return np.ascontiguousarray(values, self.dtype).data
 
-        self.workers.run([partial(convert, k) for k in range(len(slab))])
-        return Encoded({SLICES: converted})
+        return Encoded({SLICES: self.workers.map(convert, len(slab))})
 
     def assemble(self, store: Store) -> list[Finished]:
         staged = store.folder / f"atlas{self.output.path.suffix.lower()}"
@@ -86,16 +85,20 @@ class AtlasFile(Writer):
         sync(staged)
         return [Finished(staged, self.output.path), write_sidecar(store, self._values(tiles), sidecar_path(self.output))]
 
-    def _bands(self, tiles: Layout, store: Store) -> Iterator[npt.NDArray[np.generic]]:
-        """One row of tiles after the other [tile_height, width, 3]; a tile without a slice is black."""
-        shape = (tiles.tile_height, tiles.tile_width, 3)
-        slice_bytes = math.prod(shape) * self.dtype.itemsize
-        for first in range(0, self.volume.shape[0], tiles.columns):
-            band = np.zeros((tiles.tile_height, tiles.width, 3), self.dtype)
-            for k in range(min(tiles.columns, self.volume.shape[0] - first)):
-                tile = np.frombuffer(store.read(SLICES, first + k, 1, slice_bytes), self.dtype).reshape(shape)
-                band[:, k * tiles.tile_width : (k + 1) * tiles.tile_width] = tile
-            yield band
+    def _bands(self, tiles: Layout, store: Store) -> Iterator[tuple[int, npt.NDArray[np.generic]]]:
+        """The image from top to bottom, a few rows of pixels at a time: first row, [rows, width, 3]. A tile without a slice
+        is black."""
+        row_bytes = tiles.tile_width * 3 * self.dtype.itemsize
+        thickness = max(1, min(tiles.tile_height, BAND_BYTES // (row_bytes * tiles.columns)))
+        for tile_row in range(tiles.rows):
+            for first in range(0, tiles.tile_height, thickness):
+                count = min(thickness, tiles.tile_height - first)
+                band = np.zeros((count, tiles.columns, tiles.tile_width, 3), self.dtype)
+                for k in range(min(tiles.columns, self.volume.shape[0] - tile_row * tiles.columns)):
+                    z, part = tile_row * tiles.columns + k, (first * row_bytes, count * row_bytes)
+                    rows = store.read_part(SLICES, z, tiles.tile_height * row_bytes, *part)
+                    band[:, k] = np.frombuffer(rows, self.dtype).reshape(count, tiles.tile_width, 3)
+                yield tile_row * tiles.tile_height + first, band.reshape(count, tiles.width, 3)
 
     def _write(self, path: Path, tiles: Layout, store: Store) -> str:
         """Write the image. Returns the checksum of its pixels."""
@@ -104,9 +107,8 @@ class AtlasFile(Writer):
         image, digest = oiio.ImageOutput.create(os.fspath(path)), hashlib.sha256()
         if image is None or not image.open(os.fspath(path), self._spec(tiles)):
             raise self._failed("write", image.geterror() if image else oiio.geterror())
-        for row, band in enumerate(self._bands(tiles, store)):
-            first = row * tiles.tile_height
-            if not image.write_scanlines(first, first + tiles.tile_height, 0, band):
+        for first, band in self._bands(tiles, store):
+            if not image.write_scanlines(first, first + len(band), 0, band):
                 raise self._failed("write", image.geterror())
             digest.update(band.data)
         if not image.close():

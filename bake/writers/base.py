@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -153,13 +153,3 @@ def replay(slabs: Iterable[tuple[int, FloatArray]], writer: Writer, folder: Path
     for z, slab in slabs:
         store.append(z, len(slab), writer.encode(z, slab))
     return writer.assemble(store)
-
-
-def spooled(
-    store: Store, stream: str, slice_shape: tuple[int, ...], dtype: npt.DTypeLike, slab: int
-) -> Iterator[tuple[int, npt.NDArray[np.generic]]]:
-    """A stream that holds the slices of an array one after the other, read back as slabs [<= slab, *slice_shape]."""
-    depth, size = store.depth, int(np.prod(slice_shape)) * np.dtype(dtype).itemsize
-    for z in range(0, depth, slab):
-        count = min(slab, depth - z)
-        yield z, np.frombuffer(store.read(stream, z, count, size), dtype).reshape(count, *slice_shape)

@@ -12,7 +12,6 @@ import os
 import shutil
 import struct
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -63,13 +62,7 @@ class DdsFile(SequenceWriter):
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
         encoder = self._encoder()
-        converted: list[Bytes] = [b""] * len(slab)
-
-        def convert(k: int) -> None:
-            converted[k] = encoder(self._voxels(slab[k : k + 1], z + k))
-
-        self.workers.run([partial(convert, k) for k in range(len(slab))])
-        return data(*converted)
+        return data(*self.workers.map(lambda k: encoder(self._voxels(slab[k : k + 1], z + k)), len(slab)))
 
     def _voxels(self, level: FloatArray, z: int) -> npt.NDArray[np.generic]:
         """One slice as RGBA [y, x, 4], padded to whole blocks with its edge."""

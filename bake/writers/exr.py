@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import json
 import os
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ import numpy.typing as npt
 
 from solidgrain.bake.color import LINEAR, SRGB, to_linear
 from solidgrain.bake.frames import frame_paths
-from solidgrain.bake.store import Bytes, Encoded, Finished, Store
+from solidgrain.bake.store import Encoded, Finished, Store
 from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.workers import Workers
@@ -52,13 +51,8 @@ class ExrStack(Writer):
         self.channels = parse_channels(output)
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
-        encoded: dict[str, Bytes] = {}
-
-        def encode_slice(k: int) -> None:
-            encoded[self.paths[z + k].name] = self._encode_slice(z + k, slab[k])
-
-        self.workers.run([partial(encode_slice, k) for k in range(len(slab))])
-        return Encoded(files=encoded)
+        slices = self.workers.map(lambda k: self._encode_slice(z + k, slab[k]), len(slab))
+        return Encoded(files={path.name: content for path, content in zip(self.paths[z:], slices, strict=False)})
 
     def _encode_slice(self, z: int, rgb: FloatArray) -> bytes:
         import OpenEXR

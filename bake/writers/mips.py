@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +26,7 @@ from solidgrain.runtime.workers import Workers
 FILTERS = ("box", "kaiser")
 KAISER_WIDTH, KAISER_ALPHA = 3.0, 4.0  # half width in voxels of the level, and sharpness (NVIDIA Texture Tools' defaults)
 REDUCED = "reduced"  # stream: slices in linear light, filtered along x and y
-SLAB = 16  # slices
+SLAB_BYTES, THICKEST_SLAB = 24 * 2**20, 16  # of slices in linear light
 
 
 class Taps(NamedTuple):
@@ -96,10 +95,11 @@ def level_volumes(volume: Volume) -> list[Volume]:
 def level_output(output: Output, level: int) -> Output:
     """`a.vti` -> `a.mip1.vti`, `a.####.exr` -> `a.mip1.####.exr`."""
     name = output.path.name
-    match = PATTERN.search(name) or re.search(re.escape(output.kind) + "$", name, re.IGNORECASE)
+    frames = PATTERN.search(name) if "start" in output.options else None
+    match = frames or re.search(re.escape(output.kind) + "$", name, re.IGNORECASE)
     start = match.start() if match else len(name)
-    before = name[:start].removesuffix(".")
-    return replace(output, path=output.path.with_name(f"{before}.mip{level}.{name[start:].removeprefix('.')}"))
+    parts = [name[:start].removesuffix("."), f"mip{level}", name[start:].removeprefix(".")]
+    return replace(output, path=output.path.with_name(".".join(part for part in parts if part)))
 
 
 class MippedWriter(Writer):
@@ -122,25 +122,13 @@ class MippedWriter(Writer):
         return self.base.reserved
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
-        encoded = self.base.encode(z, slab)
-        linear = np.empty_like(slab)
+        return self._with_reduced(self.base.encode(z, slab), lambda k: to_linear(slab[k]), len(slab), self.volume)
 
-        def linearize(k: int) -> None:
-            linear[k] = to_linear(slab[k])
-
-        self.workers.run([partial(linearize, k) for k in range(len(slab))])
-        return self._with_reduced(encoded, linear, self.volume)
-
-    def _with_reduced(self, encoded: Encoded, linear: FloatArray, volume: Volume) -> Encoded:
-        """What the level below needs of slices in linear light, along with the slices' own bytes."""
+    def _with_reduced(self, encoded: Encoded, linear: Callable[[int], FloatArray], count: int, volume: Volume) -> Encoded:
+        """What the level below needs of slices, `linear(k)` in linear light, along with the slices' own bytes."""
         across = [taps(volume.shape[axis], self.filter, "zyx"[axis] in volume.tile) for axis in (1, 2)]
-        reduced = np.empty((len(linear), len(across[0].source), len(across[1].source), 3), np.float32)
-
-        def reduce(k: int) -> None:
-            reduced[k] = filtered(filtered(linear[k], 0, across[0]), 1, across[1])
-
-        self.workers.run([partial(reduce, k) for k in range(len(linear))])
-        return Encoded({**encoded.streams, REDUCED: [reduced.data]}, encoded.files)
+        reduced = self.workers.map(lambda k: filtered(filtered(linear(k), 0, across[0]), 1, across[1]), count)
+        return Encoded({**encoded.streams, REDUCED: [level.data for level in reduced]}, encoded.files)
 
     def assemble(self, store: Store) -> list[Finished]:
         above, finished, levels = (store, self.volume), [], []
@@ -162,7 +150,7 @@ class MippedWriter(Writer):
         folder.mkdir()
         for z, linear in self._levels(source, above, writer.volume):
             encoded = writer.encode(z, to_srgb(linear))
-            store.append(z, len(linear), self._with_reduced(encoded, linear, writer.volume))
+            store.append(z, len(linear), self._with_reduced(encoded, linear.__getitem__, len(linear), writer.volume))
         return store
 
     def _levels(self, source: Store, above: Volume, volume: Volume) -> Iterator[tuple[int, FloatArray]]:
@@ -175,9 +163,10 @@ class MippedWriter(Writer):
             content = source.read(REDUCED, z, 1, height * width * 12)
             return np.frombuffer(content, np.float32).reshape(height, width, 3)
 
-        for first in range(0, len(by.source), SLAB):
-            slab = []
-            for index, weight in zip(by.source[first : first + SLAB], by.weight[first : first + SLAB], strict=True):
+        thickness = max(1, min(THICKEST_SLAB, SLAB_BYTES // (height * width * 12)))
+        for first in range(0, len(by.source), thickness):
+            slab, last = [], first + thickness
+            for index, weight in zip(by.source[first:last], by.weight[first:last], strict=True):
                 kept = {z: kept[z] if z in kept else read(z) for z in map(int, index)}
                 slab.append(sum(kept[z] * factor for z, factor in zip(map(int, index), weight, strict=True)))
             yield first, np.stack(slab).astype(np.float32, copy=False)

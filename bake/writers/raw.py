@@ -6,7 +6,6 @@ volume = np.fromfile("a.raw", header["dtype"]).reshape(*header["shape"], header[
 from __future__ import annotations
 
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +29,12 @@ class RawFile(SequenceWriter):
         return np.dtype(TYPES[str(self.output.options["type"])])
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
-        converted: list[Bytes] = [b""] * len(slab)
-
-        def convert(k: int) -> None:
+        def convert(k: int) -> Bytes:
             level = slab[k : k + 1]
             values = self.quantized(level, z + k, self.dtype) if self.dtype.kind == "u" else self.colors(level)
-            converted[k] = np.ascontiguousarray(values, self.dtype).data
+            return np.ascontiguousarray(values, self.dtype).data
 
-        self.workers.run([partial(convert, k) for k in range(len(slab))])
-        return data(*converted)
+        return data(*self.workers.map(convert, len(slab)))
 
     def assemble(self, store: Store) -> list[Finished]:
         return [*super().assemble(store), write_sidecar(store, self._values(), sidecar_path(self.output))]

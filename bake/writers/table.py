@@ -81,10 +81,18 @@ def make_output(path: Path, kind: str = "", **options: str | int) -> Output:
     for option in row.options:
         if option.choices and options.get(option.name, option.default) not in option.choices:
             raise UsageError(f"{path}: {option.name} {options[option.name]!r}, expected one of {', '.join(option.choices)}")
+    if any(isinstance(value, int) and value < 0 for value in options.values()) or options.get("dither", 0) not in (0, 1):
+        raise UsageError(f"{path}: expected whole numbers from 0, and 0 or 1 for dither, found {options}")
+    _check_axes(path, str(options.get("axes", UPRIGHT)))
     if options.get("mips", "") not in ("", *FILTERS):
         raise UsageError(f"{path}: mips {options['mips']!r}, expected one of {', '.join(FILTERS)}")
     filled = known | {name: value for name, value in options.items() if value != ""}
     return Output(path, kind, filled | color_options(str(filled["colorspace"]), str(filled["colorconfig"])))
+
+
+def _check_axes(path: Path, axes: str) -> None:
+    if sorted(axes[1::2]) != list("xyz") or not set(axes[::2]) <= set("+-") or len(axes) != 6:
+        raise UsageError(f"{path}: axes {axes!r}, expected each of x, y and z once with its sign, such as +x-y+z")
 
 
 COMMON: dict[str, str | int] = {"dither": 0, "mips": "", "axes": UPRIGHT, "engine": ""}  # options of every format
@@ -145,12 +153,22 @@ def check_output(output: Output, volume: Volume) -> None:
     row = formats()[output.kind]
     held, turned = _levels(output, volume)[0]
     row.check(held, turned)
+    if output.options["engine"] and output.options.get("axis", "z") != "z":
+        raise UsageError(f"--for {output.options['engine']}: has axes of its own; leave out --{row.name}-axis")
     if output.options["engine"]:
         from solidgrain.bake.engines import check_engine
 
         check_engine(str(output.options["engine"]), held, turned)
 
 
-def output_exists(output: Output, volume: Volume) -> Path | None:
-    """The first file of an output that exists already."""
-    return next((path for path in output_files(output, volume) if path.exists()), None)
+def output_exists(output: Output, volume: Volume) -> bool:
+    """Whether any file of an output exists already."""
+    return any(path.exists() for path in output_files(output, volume))
+
+
+def clips(output: Output) -> bool:
+    """Whether the files of an output hold whole numbers, which have no room for colours outside [0, 1]."""
+    return str(output.options.get("type", "uint8" if output.kind == ".atlas.png" else "float")) in WHOLE_NUMBERS
+
+
+WHOLE_NUMBERS = ("uint8", "uint16", "rgba8")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,13 +39,11 @@ class VtiFile(SequenceWriter):
         return len(self._xml()) + 8 * (3 + blocks if self.compressed else 1)
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
-        levels: list[Bytes] = [b""] * len(slab)
-
-        def convert(k: int) -> None:
+        def convert(k: int) -> Bytes:
             level = self._values(slab[k], z + k).data
-            levels[k] = zlib.compress(level, LEVEL) if self.compressed else level
+            return zlib.compress(level, LEVEL) if self.compressed else level
 
-        self.workers.run([partial(convert, k) for k in range(len(slab))])
+        levels = self.workers.map(convert, len(slab))
         if not self.compressed:
             return Encoded({DATA: levels})
         return Encoded({DATA: levels, SIZES: [np.array([memoryview(level).nbytes for level in levels], "<u8").data]})

@@ -85,7 +85,9 @@ def test_boxes_and_metres_become_exemplar_pixels(solidgrain, toy_folder, flags, 
         (["--exr-compression", "lzma"], "--exr-compression"),
         (["--exr-channels", "R=r,R=g"], "--exr-channels"),
         (["--exr-channels", "R=red"], "--exr-channels"),
-        (["--resume", "--overwrite"], "--overwrite"),
+        (["--update", "--overwrite"], "--overwrite"),
+        (["--vti-type", "uint8"], "no --out of this format"),
+        (["--colorspace", ""], "--colorspace"),
     ],
 )
 def test_flags_that_cannot_work_are_refused_in_one_line(solidgrain, tmp_path, toy_folder, flags, message):
@@ -95,8 +97,8 @@ def test_flags_that_cannot_work_are_refused_in_one_line(solidgrain, tmp_path, to
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_transform_without_an_inverse_is_refused(solidgrain, tmp_path, toy_folder):
-    flat = "1,0,0,0, 0,1,0,0, 1,1,0,0, 0,0,0,1"
+@pytest.mark.parametrize("flat", ["1,0,0,0, 0,1,0,0, 1,1,0,0, 0,0,0,1", "0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,1"])
+def test_a_transform_without_an_inverse_is_refused(solidgrain, tmp_path, toy_folder, flat):
     outcome = solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy", "--transform", flat)
     assert outcome.code == 1
     assert "no inverse" in outcome.error

@@ -210,7 +210,6 @@ def test_one_bad_job_keeps_all_others_from_beginning(solidgrain, write_jobs, bad
         ("a.npy", "./a.npy", "a.npy"),
         ("a.npy", "../show/a.npy", "a.npy"),
         ("a.##.exr", "a.%02d.exr", "a.01.exr"),
-        ("a.##.exr", "a.####.exr", "a.exr.bake.json"),
     ],
 )
 def test_two_jobs_that_write_the_same_file_are_refused(solidgrain, write_jobs, first, second, culprit):

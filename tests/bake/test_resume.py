@@ -9,8 +9,10 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from solidgrain.bake.baker import bake, merge
@@ -113,6 +115,32 @@ def test_shards_in_any_order_and_in_several_processes_merge_to_the_same_files(to
     assert contents(tmp_path) == undisturbed
 
 
+def test_whole_bakes_take_up_what_shards_have_left(toy, tmp_path):
+    """Whatever slabs are there, in whichever streams: the others come after them in a stream, before them in the file."""
+    size, folders = (5, 4, 100), [tmp_path / name for name in ("whole", "shards")]
+    names = ("a.####.exr", "z.vti", "a.npy", "x.####.exr", "m.npy", "a.vdb", "a.png")
+    for folder in folders:
+        folder.mkdir()
+    bake(plan_for(toy, *outputs(folders[0], names), size=size), toy)
+    plan = plan_for(toy, *outputs(folders[1], names), size=size)
+    with pytest.raises(StopError):
+        bake(plan, toy, stop_after(32), shard=(0, 48))
+    bake(plan, toy, shard=(64, 80))
+    with pytest.raises(StopError):
+        bake(plan, toy, stop_after(16 + 48), resume=True)
+    bake(plan, toy, shard=(96, 100))
+    assert bake(plan, toy, resume=True).reused_slices == 16 + 32 + 16 + 4
+    assert contents(folders[1]) == contents(folders[0])
+
+
+def test_a_shard_without_slabs_is_done_at_once_whoever_works_beside_it(toy, tmp_path):
+    plan = plan_for(toy, *outputs(tmp_path, ("a.vti",)))
+    (output,) = plan.outputs
+    with closing(open_staging(output.path, plan.work(output), SIZE[2], 0, (0, 16), fresh=False)):
+        assert plan.shard(1, 3) == (0, 0)
+        assert bake(plan, toy, shard=(0, 0)).files == []
+
+
 def test_many_shards_are_whole_slabs_and_cover_every_slice_once(toy):
     plan = plan_for(toy, size=(4, 4, 1000))
     for count in (1, 2, 7, 63, 64, 100):
@@ -134,6 +162,80 @@ def test_work_of_another_plan_is_never_reused_silently(toy, tmp_path):
     for changes in ({"size": (7, 5, 20)}, {"samples": 8}, {"tile": "x"}):
         with pytest.raises(BakeError, match=r"a\.vti: an unfinished bake of another plan.*different: "):
             bake(plan_for(toy, *outputs(tmp_path, ("a.vti",)), **changes), toy, resume=True)
+
+
+@pytest.mark.parametrize("survivor", ["journal", "data", "finished"])
+def test_leftovers_that_have_lost_their_name_are_not_believed(toy, tmp_path, survivor, monkeypatch):
+    """As after a kill in the middle of removing them, in any order of files."""
+    plan, other = (plan_for(toy, *outputs(tmp_path, ("a.vti", "a.####.exr")), **changes) for changes in ({}, {"samples": 8}))
+    if survivor == "finished":
+        monkeypatch.setattr("solidgrain.bake.staging.Staging.commit", lambda *_: stop_after(0)(0, 0))
+    with pytest.raises(StopError):
+        bake(other, toy, stop_after(SIZE[2] if survivor != "finished" else 99), resume=True)
+    monkeypatch.undo()
+    for folder in tmp_path.glob(".*.baking"):
+        (folder / "work.json").unlink()
+        for path in folder.glob("*.0*"):
+            if survivor == "data" and path.name.startswith("journal"):
+                path.unlink()
+    bake(plan, toy, resume=True)
+    undisturbed = tmp_path / "undisturbed"
+    undisturbed.mkdir()
+    bake(plan_for(toy, *outputs(undisturbed, ("a.vti", "a.####.exr"))), toy)
+    files = contents(undisturbed)
+    for path in undisturbed.iterdir():
+        path.unlink()
+    undisturbed.rmdir()
+    assert contents(tmp_path) == files
+
+
+def test_an_error_between_two_renames_keeps_what_is_needed_to_go_on(toy, tmp_path, undisturbed, monkeypatch):
+    """Without `resume`, too: the files that are replaced already cannot be brought back."""
+    plan, replaced, count = plan_for(toy, *outputs(tmp_path)), os.replace, 0
+
+    def fail(source, target):
+        nonlocal count
+        count += Path(target).parent == tmp_path
+        if count == 5:
+            count += 1
+            raise OSError(5, "Input/output error")
+        replaced(source, target)
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(BakeError, match="Input/output error"):
+        bake(plan, toy)
+    monkeypatch.undo()
+    bake(plan, toy, resume=True)
+    assert contents(tmp_path) == undisturbed
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_waits_until_the_files_are_in_place(tmp_path, toy_folder, number):
+    process = start(toy_folder, tmp_path, "--size", "4x4x1500", "--out", "a.####.exr", "--out", "b.npy")
+    wait_for(lambda: list(tmp_path.glob("a.0*.exr")) or process.poll() is not None)
+    process.send_signal(number)
+    process.communicate(timeout=60)
+    assert len(list(tmp_path.glob("a.*.exr"))) == 1500
+    assert sorted(path.name for path in tmp_path.iterdir() if not path.name.startswith(("a.0", "a.1"))) == [
+        "a.####.exr.bake.json", "a.vti", "a.vti.bake.json", "b.npy", "b.npy.bake.json",
+    ]  # fmt: skip
+
+
+def test_a_smaller_bake_leaves_no_slices_of_the_one_that_it_replaces(solidgrain, tmp_path, toy_folder):
+    for depth in (12, 5):
+        flags = ("--size", f"4x4x{depth}", "--out", tmp_path / "a.##.exr", "--overwrite", "--quiet")
+        assert solidgrain("bake", toy_folder, *flags).code == 0
+    assert [path.name for path in sorted(tmp_path.glob("a.*.exr"))] == [f"a.{k:02d}.exr" for k in range(1, 6)]
+
+
+def test_replacing_files_can_be_resumed(solidgrain, tmp_path, toy, toy_folder):
+    flags = ("bake", toy_folder, "--size", "6x5x40", "--out", tmp_path / "a.npy", "--quiet")
+    assert solidgrain(*flags, "--seed", 1).code == 0
+    assert "already exists" in solidgrain(*flags, "--shard", "1/2").error
+    assert solidgrain(*flags, "--shard", "1/2", "--overwrite").code == 0
+    report = json.loads(solidgrain(*flags, "--resume", "--overwrite", "--json").out)
+    assert report["reused_slices"] == 16
+    assert np.array_equal(np.load(tmp_path / "a.npy"), toy.grid((40, 5, 6)))
 
 
 def test_two_processes_cannot_write_the_same_output(toy, tmp_path):

@@ -63,15 +63,27 @@ def test_a_damaged_file_is_named(solidgrain, files, name, damaged, damage):
     assert damaged in outcome.out
 
 
-def test_files_that_are_whole_but_of_something_else_are_found(solidgrain, files):
-    """As if another seed had been baked: the checksums fit the files, the colours do not fit the plan."""
+def test_files_that_are_whole_but_of_something_else_are_found(solidgrain, files, toy_folder):
+    """As if another seed had been baked: the checksums fit the file, the colours do not fit the plan."""
     manifest = json.loads((files / "a.npy.bake.json").read_text())
-    manifest["plan"]["seed"] = 4
+    flags = [4 if word == 3 else word for word in FLAGS]
+    assert solidgrain("bake", toy_folder, *flags, "--out", "a.npy", "--overwrite", "--quiet").code == 0
+    manifest["files"] = json.loads((files / "a.npy.bake.json").read_text())["files"]
     (files / "a.npy.bake.json").write_text(json.dumps(manifest))
     outcome = solidgrain("verify", "a.npy")
     assert outcome.code == 3
     assert "differ from the texture" in outcome.out
     assert solidgrain("verify", "a.npy", "--voxels", 0).code == 0
+
+
+@pytest.mark.parametrize("with_hash", [True, False])
+def test_an_edited_manifest_is_refused(solidgrain, files, with_hash):
+    manifest = json.loads((files / "a.npy.bake.json").read_text())
+    manifest["plan"]["seed"] = 4
+    if not with_hash:
+        del manifest["plan"]["hash"]
+    (files / "a.npy.bake.json").write_text(json.dumps(manifest))
+    assert "edited" in solidgrain("verify", "a.npy").error
 
 
 def test_one_wrong_voxel_in_ten_thousand_checksums_aside(solidgrain, files):
@@ -95,7 +107,15 @@ def test_another_texture_under_the_same_name_is_named(solidgrain, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [(None, "cannot read"), ("{", "not JSON"), ("{}", "not a manifest"), ("[]", "not a manifest")]
+    ("content", "message"),
+    [
+        (None, "cannot read"),
+        ("{", "not JSON"),
+        ("{}", "not a manifest"),
+        ("[]", "not a manifest"),
+        ('{"plan": {}, "output": "a.vti", "work": "", "files": {}}', "not a manifest"),
+        ('{"plan": {}, "output": "a.vti", "work": "", "files": {"a.vti": {}}}', "not a manifest"),
+    ],
 )
 def test_a_manifest_that_is_none_is_refused_in_one_line(solidgrain, tmp_path, content, message):
     if content is not None:
