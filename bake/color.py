@@ -68,6 +68,19 @@ def to_srgb(linear: FloatArray) -> FloatArray:
     return encoded
 
 
+def to_half(values: FloatArray) -> npt.NDArray[np.float16]:
+    """`values.astype(np.float16)`, bit for bit, in half the time where all of them are normal numbers of that type.
+
+    Adding just under half of the last place that stays, and one more where that place is odd, rounds to the nearest even.
+    """
+    if values.size == 0 or values.min() < 2.0**-14 or not values.max() < 65504:
+        return values.astype(np.float16)
+    bits = np.ascontiguousarray(values).view(np.uint32)
+    rounded = bits + (np.uint32(0xFFF) + ((bits >> np.uint32(13)) & np.uint32(1)))
+    shifted = (rounded >> np.uint32(13)) - np.uint32((127 - 15) << 10)
+    return shifted.astype(np.uint16).view(np.float16)
+
+
 def quantize(rgb: FloatArray, dtype: npt.DTypeLike, noise: FloatArray | None = None) -> npt.NDArray[np.generic]:
     """[0, 1] to 0 .. the largest of an unsigned type, to the nearest, after triangular `noise` in steps of one is added.
 

@@ -6,12 +6,11 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from solidgrain.bake.arguments import parse_count, parse_positive
+from solidgrain.runtime.errors import UsageError
 
-if TYPE_CHECKING:
-    from solidgrain.train.quality import Evaluation
+SHEETS = (".png", ".html")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--slices", type=parse_positive, default=50, metavar="N", help="axis-aligned and oblique slices, one instance each (50)"
     )
+    add("--inception", type=Path, metavar="FILE", help="InceptionV3 weights (pt_inception-*.pth): measure SIFID as well")
+    add("--sheet", type=Path, metavar="FILE", help="write pictures and figures into a .png or a .html")
     add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
     add("--json", action="store_true", help="print one JSON object on stdout")
     add("--card", action="store_true", help="write the table into the bundle's model card")
@@ -30,37 +31,44 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from solidgrain.export.card import with_quality
+    from solidgrain.export.figures import make_figures
+    from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load
     from solidgrain.runtime.bundle import CARD
     from solidgrain.runtime.files import replacing
+    from solidgrain.train.copying import measure_copying
     from solidgrain.train.exemplar import read_exemplar
+    from solidgrain.train.inception import Inception
     from solidgrain.train.quality import SMALLEST, evaluate
 
+    if arguments.sheet:
+        check_sheet(arguments.sheet, arguments.exemplar)
+    inception = Inception(arguments.inception) if arguments.inception else None
     texture = load(arguments.source, threads=arguments.threads)
     manifest = texture.bundle.manifest
     exemplar = read_exemplar(arguments.exemplar, SMALLEST)
     grain = manifest["training"].get("settings", {}).get("grain", "none")
     print(f"measuring {2 * arguments.slices} slices of {texture.name}", file=sys.stderr)
-    evaluation = evaluate(exemplar, texture.sample, arguments.slices, grain)
-    print(json.dumps(asdict(evaluation), indent=2) if arguments.json else table(evaluation))
+    evaluation = evaluate(exemplar, texture.sample, arguments.slices, grain, inception)
+    copying, pairs = measure_copying(exemplar, texture.sample, grain)
+    figures = make_figures(evaluation, copying)
+    found = asdict(evaluation) | {"copying": asdict(copying)}
+    print(json.dumps(found, indent=2) if arguments.json else figures.markdown())
+    if arguments.sheet:
+        write_sheet(arguments.sheet, make_sheet(texture.name, exemplar, texture.sample, grain, pairs, figures))
     if arguments.card:
         card = texture.bundle.folder / CARD
         written = card.read_text("utf-8") if card.is_file() else f"# {texture.name}\n"
         with replacing(card) as file:
-            file.write(with_quality(written, table(evaluation)).encode())
+            file.write(with_quality(written, figures.markdown()).encode())
     return 0
 
 
-def table(evaluation: Evaluation) -> str:
-    """The measures as a table of Markdown."""
-    lines = [
-        f"Distances to the exemplar over its own floor, mean ± standard deviation over {evaluation.slices} slices of "
-        f"{evaluation.crop}² pixels, through the runtime:",
-        "",
-        "| measure | floor | axis-aligned slices | oblique slices |",
-        "|---|---|---|---|",
-    ]
-    for name, floor in evaluation.floor.items():
-        (axis, axis_spread), (oblique, oblique_spread) = evaluation.axis[name], evaluation.oblique[name]
-        lines.append(f"| {name} | {floor:.4g} | {axis:.2f} ± {axis_spread:.2f} | {oblique:.2f} ± {oblique_spread:.2f} |")
-    return "\n".join(lines)
+def check_sheet(sheet: Path, exemplar: Path) -> None:
+    """Raises UsageError for a sheet that could not be written, before minutes are spent on measuring."""
+    if sheet.suffix.lower() not in SHEETS:
+        raise UsageError(f"--sheet {sheet}: expected a name that ends in {' or '.join(SHEETS)}")
+    if not sheet.parent.is_dir():
+        raise UsageError(f"--sheet {sheet}: no folder {sheet.parent}; make it first")
+    if sheet.exists() and exemplar.exists() and sheet.samefile(exemplar):
+        raise UsageError(f"--sheet {sheet}: is the exemplar itself; choose another name")

@@ -30,6 +30,11 @@ def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = Fa
     near the origin or far from it; BundleError if the bundle cannot be written.
     """
     run = open_run(run_folder)
+    if run.settings.noise_at_input:
+        raise TrainingError(
+            f"{run_folder}: a run with --variant {run.settings.variant} feeds noise at the input, which a bundle cannot hold; "
+            "look at its samples, or train with --variant paper"
+        )
     state = run.load_checkpoint()
     if state is None:
         raise TrainingError(f"{run_folder}: no checkpoint yet; let solidgrain train --resume {run_folder} go on for a while")

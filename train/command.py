@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive, parse_seed
 from solidgrain.runtime.errors import TrainingError, UsageError
+from solidgrain.train.variants import CHANGES, canonical
 
 if TYPE_CHECKING:
     import torch
@@ -22,7 +23,17 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 SMALLEST_PATCH = 32  # pixels
-FIXED = ("preset", "anisotropic", "patch", "batch", "seed", "precision", "license", "credit")  # what a run settles for good
+FIXED = (
+    "preset",
+    "variant",
+    "anisotropic",
+    "patch",
+    "batch",
+    "seed",
+    "precision",
+    "license",
+    "credit",
+)  # what a run settles for good
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where.add_argument("--out", type=Path, metavar="RUN", help="the run directory to make")
     where.add_argument("--resume", type=Path, metavar="RUN", help="go on with a run where its last checkpoint left it")
     add("--preset", choices=("fast", "paper"), help="fast: few CPU minutes; paper: the paper's settings (fast)")
+    add(
+        "--variant",
+        type=canonical,
+        choices=tuple(CHANGES),
+        help="the method (paper), or what the paper compares it with: docs/training.md (paper)",
+    )
     add("--iterations", type=parse_positive, metavar="N", help="stop after N iterations in all")
     add("--minutes", type=parse_minutes, metavar="M", help="stop after M minutes of training in all")
     add(
@@ -63,12 +80,16 @@ def run(arguments: argparse.Namespace) -> int:
     torch.set_num_threads(arguments.threads or usable_threads())
     training = resume(arguments) if arguments.resume else start(arguments)
     stop = StopRequest()
-    train(training, training.budget, device, Progress(training.budget, arguments.quiet).show, stop.requested)
+    progress = Progress(training.budget, arguments.quiet)
+    train(training, training.budget, device, progress.show, stop.requested, progress.warn)
     folder = training.folder
     if stop.requested():
         print(f"stopped and saved; go on with: solidgrain train --resume {folder}", file=sys.stderr)
         return INTERRUPTED
-    print(f"{folder}: done; next: solidgrain export {folder} --out BUNDLE", file=sys.stderr)
+    way = f"next: solidgrain export {folder} --out BUNDLE"
+    if training.settings.noise_at_input:
+        way = f"its slices are in {folder / 'samples'}; a bundle cannot hold noise at the input"
+    print(f"{folder}: done; {way}", file=sys.stderr)
     return 0
 
 
@@ -76,10 +97,13 @@ def start(arguments: argparse.Namespace) -> Run:
     """A new run directory for the photograph, with a warning if one texture cannot describe it."""
     from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity, read_photograph
     from solidgrain.train.run import Source, create_run
+    from solidgrain.train.vgg import find_weights
 
     if arguments.exemplar is None:
         raise UsageError("no EXEMPLAR given; expected a photograph to learn from")
     settings = make_settings(arguments)
+    if settings.style_features == "vgg":
+        find_weights()  # before there is a run directory
     exemplar, colorspace, warning = read_photograph(arguments.exemplar, settings.patch)
     if warning:
         print(f"warning: {arguments.exemplar}: {warning}", file=sys.stderr)
@@ -97,12 +121,13 @@ def start(arguments: argparse.Namespace) -> Run:
 def make_settings(arguments: argparse.Namespace) -> Settings:
     """The preset, with what the flags change. Raises UsageError for a patch that is too small."""
     from solidgrain.train.settings import preset
+    from solidgrain.train.variants import vary
 
     changes = {name: getattr(arguments, name) for name in ("patch", "batch", "seed", "precision")}
     changes = {name: value for name, value in changes.items() if value is not None}
     if changes.get("patch", SMALLEST_PATCH) < SMALLEST_PATCH:
         raise UsageError(f"--patch {arguments.patch}: expected at least {SMALLEST_PATCH}")
-    return preset(arguments.preset or "fast", **changes)
+    return vary(preset(arguments.preset or "fast", **changes), arguments.variant or "paper")
 
 
 def with_grain(settings: Settings, anisotropic: str | None, exemplar: Any) -> Settings:
@@ -188,3 +213,8 @@ class Progress:
             f"{done:.0%}, {left:.1f} min left, L_D {report.critic_loss:.2f}, L_style {report.style:.4f}"
         )
         print(f"\r{line}  " if self.terminal else line, end="" if self.terminal else "\n", file=sys.stderr, flush=True)
+
+    def warn(self, warning: str) -> None:
+        """A line that stays, whether quiet or not."""
+        end_of_progress = "\n" if self.terminal and not self.quiet else ""
+        print(f"{end_of_progress}warning: {warning}", file=sys.stderr, flush=True)

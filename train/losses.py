@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from solidgrain.train.critic import Critic
+from solidgrain.train.settings import Settings
+from solidgrain.train.vgg import STYLE_LAYERS, Vgg
+
+Judge = Callable[[Tensor], tuple[Tensor, list[Tensor]]]  # images -> D's logits [B, 1], activations of F per layer
+
+
+def make_judge(settings: Settings, critic: Critic, device: torch.device) -> Judge:
+    """What L_G asks of a slice: the verdict of D, and the activations of F, which is D itself but in some comparisons."""
+    if settings.style_features == "critic":
+        return critic
+    vgg = Vgg(device)
+
+    def judge(images: Tensor) -> tuple[Tensor, list[Tensor]]:
+        logits = critic(images)[0] if settings.trains_critic else torch.zeros(len(images), 1, device=device)
+        activations = vgg.features(images, padding=1)
+        return logits, [activations[layer] for layer in STYLE_LAYERS]
+
+    return judge
 
 
 def gradient_penalty(critic: Critic, real: Tensor, fake: Tensor, generator: torch.Generator) -> Tensor:
@@ -23,14 +41,19 @@ def gradient_penalty(critic: Critic, real: Tensor, fake: Tensor, generator: torc
     return penalty
 
 
-def style_loss(real: Sequence[Tensor], fake: Sequence[Tensor], pooled: bool) -> Tensor:
+def style_loss(real: Sequence[Tensor], fake: Sequence[Tensor], pooled: bool, relative: bool = False) -> Tensor:
     """L_style of Eq. 4: the mean over layers of the mean absolute difference of Gram matrices.
 
     The Gram matrix is F F^T / pixels, the normalisation of the authors' code; the equation's 1 / (4 N² M²) differs from it
     by a factor per layer. `pooled` averages the matrices over the batch before they are compared: all patches come from
-    one exemplar, and their mean is a less noisy target than any one patch.
+    one exemplar, and their mean is a less noisy target than any one patch. `relative` divides each layer's term by the mean
+    absolute entry of the real matrix, for features whose scale is not ours to train.
     """
-    terms = [(gram_matrix(r, pooled) - gram_matrix(f, pooled)).abs().mean() for r, f in zip(real, fake, strict=True)]
+    terms = []
+    for of_real, of_fake in zip(real, fake, strict=True):
+        wanted, found = gram_matrix(of_real, pooled), gram_matrix(of_fake, pooled)
+        difference = (wanted - found).abs().mean()
+        terms.append(difference / wanted.abs().mean() if relative else difference)
     return torch.stack(terms).mean()
 
 

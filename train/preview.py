@@ -12,7 +12,7 @@ from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.files import temporary_name
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.noise import draw_tables
-from solidgrain.train.sampler import Sampler
+from solidgrain.train.sampler import Octaves
 from solidgrain.train.settings import Settings
 from solidgrain.train.slices import flat_slice, from_quaternions
 
@@ -20,7 +20,7 @@ SIZE = 256  # pixels along each side of a slice
 
 
 @torch.no_grad()
-def render_slices(sampler: Sampler, settings: Settings, device: torch.device) -> FloatArray:
+def render_slices(sampler: Octaves, settings: Settings, device: torch.device) -> FloatArray:
     """Two slices of the same instance, [SIZE, 2 SIZE, 3] in [0, 1]: z = 0, and an oblique plane.
 
     The noise is the same every time, so that a folder of samples shows the training and nothing else.
@@ -34,7 +34,7 @@ def render_slices(sampler: Sampler, settings: Settings, device: torch.device) ->
     return image
 
 
-def write_preview(path: Path, sampler: Sampler, settings: Settings, exemplar: FloatArray, device: torch.device) -> None:
+def write_preview(path: Path, sampler: Octaves, settings: Settings, exemplar: FloatArray, device: torch.device) -> None:
     """The exemplar's middle (or all of it, repeated never, padded with black) and the two slices, as an 8-bit PNG."""
     panel = np.zeros((SIZE, SIZE, 3), np.float32)
     top, left = (max(extent - SIZE, 0) // 2 for extent in exemplar.shape[:2])

@@ -1,39 +1,36 @@
 """How good a texture is: distances between the inner statistics of its slices and of the exemplar, over the exemplar's floor.
 
 A distance alone says little. The floor is the same distance between disjoint crops of the exemplar itself, and results are
-quoted as ratios to it. Five measures, since they disagree:
+quoted as ratios to it. Several measures, since they disagree:
 
     vgg_frechet  Fréchet distance between VGG-16 features of two layers (as SIFID, Shaham et al. 2019, but on VGG)
     gram         relative difference of Gram matrices of four VGG-16 layers (Gatys et al. 2015)
     patches      sliced Wasserstein distance of 7x7 patches on three pyramid levels (Karras et al. 2018)
     color        sliced Wasserstein distance of the colours
     coarse_gram  `gram` at a quarter of the resolution: large structures
+    sifid        Fréchet distance between InceptionV3 features (Shaham et al. 2019), where the user has its weights
 
 Images here are tensors [1, 3, H, W] in [0, 1].
 """
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from solidgrain.runtime.errors import SolidgrainError
+from solidgrain.train.cuts import Sample, as_image, axis_rotation, cut, oblique_rotation, random_place
 from solidgrain.train.exemplar import FloatArray
-from solidgrain.train.slices import UNIT, about_axis, flat_slice, from_quaternions
+from solidgrain.train.inception import Inception
+from solidgrain.train.vgg import STYLE_LAYERS, Vgg
 
-Sample = Callable[[npt.NDArray[np.float64], int], FloatArray]  # points [P, 3] in exemplar pixels, seed -> rgb [P, 3]
 Measures = dict[str, float]
 
-FEATURES = ("1.0", "1.2", "pool", "2.6", "2.8", "pool", "3.12", "3.14", "3.16", "pool", "4.20")  # VGG-16 convolutions
-FRECHET_LAYERS, GRAM_LAYERS = (1, 3), (0, 2, 4, 7)
+FRECHET_LAYERS, GRAM_LAYERS = (1, 3), STYLE_LAYERS
 LARGEST_CROP = 256  # pixels
 SMALLEST = 64  # pixels along each side of an exemplar: its crops must outlast the pyramids
 
@@ -50,13 +47,15 @@ class Evaluation:
 
 
 @torch.no_grad()
-def evaluate(exemplar: FloatArray, sample: Sample, slices: int = 10, grain: str = "none") -> Evaluation:
+def evaluate(
+    exemplar: FloatArray, sample: Sample, slices: int = 10, grain: str = "none", inception: Inception | None = None
+) -> Evaluation:
     """Measure axis-aligned and oblique slices of a texture, one of each per seed, against its exemplar.
 
     With a grain only those orientations are taken that a slice through its axis has, since no loss ever saw the others.
     """
-    measure = Measure()
-    image = torch.from_numpy(exemplar).permute(2, 0, 1)[None]
+    measure = Measure(inception)
+    image = as_image(exemplar)
     size = min(image.shape[2] // 2, image.shape[3] // 2, LARGEST_CROP)
     crops = [measure.statistics(crop) for crop in disjoint_crops(image, size)]
     pairs = [(a, b) for i, a in enumerate(crops) for b in crops[:i]]
@@ -66,7 +65,8 @@ def evaluate(exemplar: FloatArray, sample: Sample, slices: int = 10, grain: str 
         measured = []
         for seed in range(slices):
             generator = torch.Generator().manual_seed(seed)
-            picture = measure.statistics(_slice(sample, size, rotation_of(seed, generator), seed, generator))
+            rotation = rotation_of(seed, generator)
+            picture = measure.statistics(as_image(cut(sample, size, rotation, seed, random_place(generator))))
             measured.append(_mean(measure.distances(crop, picture) for crop in crops[:4]))
         return {name: _spread([one[name] / floor[name] for one in measured]) for name in floor}
 
@@ -74,8 +74,8 @@ def evaluate(exemplar: FloatArray, sample: Sample, slices: int = 10, grain: str 
         crop=size,
         slices=slices,
         floor=floor,
-        axis=ratios(lambda seed, generator: _axis_rotation(seed, grain)),
-        oblique=ratios(lambda seed, generator: _oblique_rotation(generator, grain)),
+        axis=ratios(lambda seed, generator: axis_rotation(seed, grain)),
+        oblique=ratios(lambda seed, generator: oblique_rotation(generator, grain)),
     )
 
 
@@ -83,28 +83,6 @@ def disjoint_crops(image: Tensor, size: int) -> list[Tensor]:
     """The image [1, 3, H, W] cut into squares, from the top left."""
     rows, columns = (range(0, extent - size + 1, size) for extent in image.shape[2:])
     return [image[..., top : top + size, left : left + size] for top in rows for left in columns]
-
-
-def _slice(sample: Sample, size: int, rotation: Tensor, seed: int, generator: torch.Generator) -> Tensor:
-    """A square slice of the instance `seed`, at a random place."""
-    place = 2048 * torch.rand(3, generator=generator, dtype=torch.float64)
-    points = (flat_slice(size, torch.device("cpu")) * UNIT).double() @ rotation.double().T + place
-    rgb = sample(points.numpy(), seed)
-    return torch.from_numpy(rgb).reshape(size, size, 3).permute(2, 0, 1)[None]
-
-
-def _axis_rotation(seed: int, grain: str) -> Tensor:
-    """Planes along the axes, in turn: all three of them, or the two that hold the grain's axis."""
-    quarter = torch.tensor([torch.pi / 2])
-    upright = [torch.eye(3), about_axis(0, quarter)[0], about_axis(1, quarter)[0]]  # xy, xz, zy
-    allowed = {"none": upright, "x": [upright[0], upright[1]], "y": [upright[0], upright[2]]}[grain]
-    return allowed[seed % len(allowed)]
-
-
-def _oblique_rotation(generator: torch.Generator, grain: str) -> Tensor:
-    if grain != "none":
-        return about_axis("xyz".index(grain), 2 * torch.pi * torch.rand(1, generator=generator))[0]
-    return from_quaternions(F.normalize(torch.randn(1, 4, generator=generator), dim=1))[0]
 
 
 @dataclass(frozen=True)
@@ -116,17 +94,18 @@ class Statistics:
     coarse_grams: list[Tensor]
     patches: list[Tensor]  # sorted projections, per pyramid level
     colors: Tensor  # sorted projections
+    inception: tuple[Tensor, Tensor] | None  # mean and covariance of features
 
 
 class Measure:
-    """The measures, with the VGG-16 weights that the package stlpips-pytorch carries (BSD-2-Clause)."""
+    """The measures, with pretrained features (vgg.py, inception.py)."""
 
-    def __init__(self) -> None:
-        self.weights = _vgg_weights()
+    def __init__(self, inception: Inception | None = None) -> None:
+        self.vgg, self.inception = Vgg(), inception
 
     def statistics(self, image: Tensor) -> Statistics:
-        features = self._features(image)
-        coarse = self._features(F.avg_pool2d(image, 4))
+        features = self.vgg.features(image)
+        coarse = self.vgg.features(F.avg_pool2d(image, 4))
         levels = [F.avg_pool2d(image, factor) for factor in (1, 2, 4)]
         return Statistics(
             moments=[_moments(F.avg_pool2d(features[layer], 2)) for layer in FRECHET_LAYERS],
@@ -134,41 +113,21 @@ class Measure:
             coarse_grams=[_gram(coarse[layer]) for layer in GRAM_LAYERS if layer < len(coarse)],
             patches=[_projections(F.unfold(level, 7)[0].T, 256) for level in levels],
             colors=_projections(image.flatten(2)[0].T, 32),
+            inception=_moments(self.inception.features(image)) if self.inception else None,
         )
 
     def distances(self, exemplar: Statistics, other: Statistics) -> Measures:
         moments = zip(exemplar.moments, other.moments, strict=True)
-        return {
+        measures = {
             "vgg_frechet": sum(_frechet(a, b) for a, b in moments),
             "gram": _gram_distance(exemplar.grams, other.grams),
             "patches": float(np.mean([_wasserstein(a, b) for a, b in zip(exemplar.patches, other.patches, strict=True)])),
             "color": _wasserstein(exemplar.colors, other.colors),
             "coarse_gram": _gram_distance(exemplar.coarse_grams, other.coarse_grams),
         }
-
-    def _features(self, image: Tensor) -> list[Tensor]:
-        """Activations after each convolution of VGG-16, without padding, average pools between its blocks."""
-        x = (image * 2 - 1 - self.weights["scaling_layer.shift"]) / self.weights["scaling_layer.scale"]
-        found = []
-        for layer in FEATURES:
-            if layer == "pool":
-                x = F.avg_pool2d(x, 2)
-            elif min(x.shape[2:]) < 3:
-                break
-            else:
-                kernel, bias = (self.weights[f"net.slice{layer}.{part}"] for part in ("weight", "bias"))
-                x = F.relu(F.conv2d(x, kernel, bias))
-                found.append(x)
-        return found
-
-
-def _vgg_weights() -> dict[str, Tensor]:
-    spec = importlib.util.find_spec("stlpips_pytorch")
-    if spec is None or spec.origin is None:
-        raise SolidgrainError("the VGG-16 weights are missing; pip install 'solidgrain[evaluate]'")
-    path = Path(spec.origin).parent / "weights" / "vST0.0" / "vgg_shift_tolerant.pth"
-    weights: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
-    return weights
+        if exemplar.inception and other.inception:
+            measures["sifid"] = _frechet(exemplar.inception, other.inception)
+        return measures
 
 
 def _moments(features: Tensor) -> tuple[Tensor, Tensor]:

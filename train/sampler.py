@@ -13,32 +13,42 @@ HIDDEN_LAYERS = 5
 BINS = 4  # consecutive bins of octaves; bin l enters hidden layer l, the last hidden layer gets none
 
 
-class Sampler(nn.Module):
-    """An MLP on a learned constant, with a quarter of the octaves injected into each of its first four hidden layers."""
+class Octaves(nn.Module):
+    """The transformation model: noise at a point through learned T_i (Eq. 1). What every sampler begins with."""
 
     octave_scale: Tensor
 
     def __init__(self, settings: Settings, generator: torch.Generator) -> None:
         super().__init__()
-        n, m = settings.octaves, settings.width
         self.directions = nn.Parameter(_start_directions(settings, generator))  # [n, 3, 3]
         self.register_buffer("octave_scale", _octave_scale(settings).to(generator.device))  # [n, 3, 3] or [n, 1, 1]
-        self.constant = nn.Parameter(torch.ones(m, device=generator.device))
-        self.hidden = nn.ModuleList(Linear(m, m, generator) for _ in range(HIDDEN_LAYERS))
-        shape = (BINS, n // BINS, m)
-        noise_weights = torch.randn(shape, generator=generator, device=generator.device)
-        self.noise_weights = nn.Parameter(settings.noise_weight_start * noise_weights)  # A of Eq. 2, transposed
-        self.output = Linear(m, 3, generator, gain=1.0)
         self.offsets: Tensor | None = None  # [n, 3] texels; training shifts its slices at random instead
 
     def transforms(self) -> Tensor:
         """T_i [n, 3, 3], on coordinates in units of 64 pixels."""
         return self.directions * self.octave_scale
 
+    def noise(self, tables: Tensor, points: Tensor) -> Tensor:
+        """eta(c): tables [n, R, R, R], points [B, P, 3] -> [B, P, n]."""
+        return look_up(tables, self.transforms(), points, self.offsets)
+
+
+class Sampler(Octaves):
+    """An MLP on a learned constant, with a quarter of the octaves injected into each of its first four hidden layers."""
+
+    def __init__(self, settings: Settings, generator: torch.Generator) -> None:
+        super().__init__(settings, generator)
+        n, m = settings.octaves, settings.width
+        self.constant = nn.Parameter(torch.ones(m, device=generator.device))
+        self.hidden = nn.ModuleList(Linear(m, m, generator) for _ in range(HIDDEN_LAYERS))
+        shape = (BINS, n // BINS, m)
+        noise_weights = torch.randn(shape, generator=generator, device=generator.device)
+        self.noise_weights = nn.Parameter(settings.noise_weight_start * noise_weights)  # A of Eq. 2, transposed
+        self.output = Linear(m, 3, generator, gain=1.0)
+
     def forward(self, tables: Tensor, points: Tensor) -> Tensor:
         """Colour at points: tables [n, R, R, R], points [B, P, 3] -> rgb [B, P, 3], not clipped to [0, 1]."""
-        eta = look_up(tables, self.transforms(), points, self.offsets)  # (B, P, n)
-        bins = eta.chunk(BINS, dim=-1)
+        bins = self.noise(tables, points).chunk(BINS, dim=-1)  # (B, P, n / 4) each
         x: Tensor = self.constant
         for layer, dense in enumerate(self.hidden):
             y: Tensor = dense(x)
@@ -47,6 +57,29 @@ class Sampler(nn.Module):
             x = activate(y)
         rgb: Tensor = self.output(x)
         return rgb
+
+
+class NoiseAtInputSampler(Octaves):
+    """The baseline of Fig. 2 a: a plain MLP of the same size on the noise vector. Bundles cannot hold it."""
+
+    def __init__(self, settings: Settings, generator: torch.Generator) -> None:
+        super().__init__(settings, generator)
+        n, m = settings.octaves, settings.width
+        self.hidden = nn.ModuleList(Linear(n if layer == 0 else m, m, generator) for layer in range(HIDDEN_LAYERS))
+        self.output = Linear(m, 3, generator, gain=1.0)
+
+    def forward(self, tables: Tensor, points: Tensor) -> Tensor:
+        """As `Sampler.forward`."""
+        x = self.noise(tables, points)
+        for dense in self.hidden:
+            x = activate(dense(x))
+        rgb: Tensor = self.output(x)
+        return rgb
+
+
+def make_sampler(settings: Settings, generator: torch.Generator) -> Sampler | NoiseAtInputSampler:
+    """The sampler that the settings ask for."""
+    return NoiseAtInputSampler(settings, generator) if settings.noise_at_input else Sampler(settings, generator)
 
 
 def _octave_scale(settings: Settings) -> Tensor:

@@ -17,6 +17,7 @@ class Settings:
     """
 
     preset: str = "fast"
+    variant: str = "paper"  # the method itself, or one of the paper's comparisons with it (variants.py)
     seed: int = 0
 
     # Sampler (Sec. 3.1)
@@ -26,18 +27,21 @@ class Settings:
     octave_span: float = 7.0  # octave i scales by 2 ** (span * i / (n - 1))
     orthogonal_start: bool = True  # T_i starts as a random orthogonal matrix, else N(0,1)^{3x3}
     noise_weight_start: float = 0.5  # standard deviation of A at the start
+    noise_at_input: bool = False  # all octaves enter S at its input (Fig. 2 a), none its hidden layers
 
     # Slices (Sec. 4, implementation details)
     patch: int = 64  # pixels along each side of a patch
     batch: int = 4
     transposed: bool = True  # real patches of isotropic materials are also transposed by chance, not only flipped
-    rotations: Literal["uniform", "euler"] = "uniform"  # uniform on SO(3), or the authors' three angles in [0°, 90°]
+    # uniform on SO(3), the authors' three angles in [0°, 90°], or along the axes only (Henzler et al. 2020)
+    rotations: Literal["uniform", "euler", "axis"] = "uniform"
     grain: Literal["none", "x", "y"] = "none"  # the image axis about which slices turn; "none" turns them freely
     grain_ratio: float = 1.0  # length of the structures across the grain over along it, at the start
 
     # Losses (Eq. 3, Eq. 4)
     alpha: float = 0.1  # weight of the adversarial term in L_G
     beta: float = 1.0  # weight of L_style
+    style_features: Literal["critic", "vgg"] = "critic"  # F of L_style: D itself, or a pretrained VGG-16
     penalty: float = 10.0  # lambda, weight of the gradient penalty
     penalty_every: int = 4  # iterations between penalties, each weighted that much more (lazy regularisation, StyleGAN2)
     drift: float = 0.001  # weight of E[D(r)^2] (gramgan/main.py; not in the paper)
@@ -57,6 +61,11 @@ class Settings:
     checkpoint_every: int = 250  # iterations
     sample_every: int = 500
     report_every: int = 20
+
+    @property
+    def trains_critic(self) -> bool:
+        """Whether any term of L_G needs D: with alpha = 0 it still learns, since L_style lives on its activations."""
+        return self.alpha != 0 or self.style_features == "critic"
 
 
 @dataclass(frozen=True)

@@ -33,9 +33,12 @@ def draw_rotations(settings: Settings, generator: torch.Generator) -> Tensor:
     """Rotation matrices [B, 3, 3]: free for isotropic materials, about the grain's axis for anisotropic ones.
 
     The paper asks for "all possible slice orientations"; its code draws three Euler angles from [0°, 90°], which favours
-    some. "uniform" draws from SO(3) evenly, through unit quaternions.
+    some. "uniform" draws from SO(3) evenly, through unit quaternions. "axis" is what Henzler et al. (2020) do.
     """
     batch, device = settings.batch, generator.device
+    if settings.rotations == "axis":
+        planes = upright(settings.grain, device)
+        return planes[torch.randint(len(planes), (batch,), generator=generator, device=device)]
     if settings.grain != "none":
         angles = 2 * math.pi * torch.rand(batch, generator=generator, device=device)
         return about_axis("xyz".index(settings.grain), angles)
@@ -43,6 +46,13 @@ def draw_rotations(settings: Settings, generator: torch.Generator) -> Tensor:
         angles = 0.5 * math.pi * torch.rand(3, batch, generator=generator, device=device)
         return about_axis(2, angles[2]) @ about_axis(1, angles[1]) @ about_axis(0, angles[0])
     return from_quaternions(F.normalize(torch.randn(batch, 4, generator=generator, device=device), dim=1))
+
+
+def upright(grain: str, device: torch.device) -> Tensor:
+    """The planes along the axes, as rotations [K, 3, 3] of xy: xy, xz and zy, or the two of them that hold the grain."""
+    quarter = torch.tensor([math.pi / 2], device=device)
+    xy, xz, zy = torch.eye(3, device=device), about_axis(0, quarter)[0], about_axis(1, quarter)[0]
+    return torch.stack({"none": [xy, xz, zy], "x": [xy, xz], "y": [xy, zy]}[grain])
 
 
 def about_axis(axis: int, angles: Tensor) -> Tensor:

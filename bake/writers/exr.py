@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.color import LINEAR, SRGB, to_linear
+from solidgrain.bake.color import LINEAR, SRGB, to_half, to_linear
 from solidgrain.bake.frames import frame_paths
 from solidgrain.bake.store import Encoded, Finished, Store
 from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
@@ -67,7 +67,7 @@ class ExrStack(Writer):
         if dtype is np.float16 and self.output.colorspace not in (LINEAR, SRGB):
             rgb = rgb.clip(-HALF_LARGEST, HALF_LARGEST)  # beyond it, half-float is infinite
         if list(self.channels.items()) == [("R", "r"), ("G", "g"), ("B", "b")]:
-            return {"RGB": np.ascontiguousarray(rgb, dtype)}
+            return {"RGB": to_half(rgb) if dtype is np.float16 else np.ascontiguousarray(rgb, dtype)}
         values = {"luma": to_linear(srgb) @ LUMA, "one": np.ones(rgb.shape[:2], dtype)}
         values |= {source: rgb[..., k] for k, source in enumerate("rgb")}
         return {name: np.ascontiguousarray(values[source], dtype) for name, source in self.channels.items()}

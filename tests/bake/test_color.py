@@ -15,7 +15,7 @@ import OpenImageIO as oiio
 import pytest
 
 from solidgrain.bake.baker import bake
-from solidgrain.bake.color import LINEAR, SRGB, color_options, from_srgb, quantize, to_linear, to_srgb, triangular
+from solidgrain.bake.color import LINEAR, SRGB, color_options, from_srgb, quantize, to_half, to_linear, to_srgb, triangular
 from solidgrain.bake.writers import make_output
 from solidgrain.runtime import UsageError
 from tests.bake.test_writers import expected, plan_for
@@ -343,3 +343,17 @@ def test_a_dithered_file_is_the_same_however_it_is_cut_and_differs_from_a_plain_
     assert 0 < np.abs(plain - dithered).max() <= 1
     grid = np.load(bake(plan_for(toy, make_output(tmp_path / "a.npy")), toy).files[0]).astype(np.float32)
     assert np.array_equal(quantize(grid, np.uint8, triangular(grid.shape, 0)).reshape(-1, 3), dithered)
+
+
+def test_half_floats_are_numpys_bit_for_bit():
+    draw = np.random.default_rng(5)
+    for values in (
+        draw.random(1_000_000, np.float32),
+        np.exp2(draw.uniform(-14, 16, 1_000_000)).astype(np.float32).clip(None, 65503),
+        np.exp2(draw.uniform(-30, 0, 100_000)).astype(np.float32),
+        np.array([0.0, 1.0, 0.5, 2.0**-14, 65503.9, 70000.0, np.inf], np.float32),
+        (np.arange(2**16, dtype=np.uint32) * 4096 + 0x38800000).view(np.float32)[:40000],  # every tie
+        np.empty((0, 3), np.float32),
+    ):
+        with np.errstate(over="ignore"):
+            assert np.array_equal(to_half(values).view(np.uint16), values.astype(np.float16).view(np.uint16))

@@ -30,6 +30,14 @@ def test_crops_of_the_exemplar_score_about_one():
         assert 0.4 < evaluation.axis[name][0] < 1.6
 
 
+@pytest.mark.parametrize("side", [64, 72, 80, 88, 136])
+def test_exemplars_of_any_size_are_measured(side):
+    """Whatever VGG's pyramid leaves of their crops."""
+    exemplar = blotches(side, side)
+    evaluation = evaluate(exemplar, lambda points, seed: np.resize(exemplar, (len(points), 3)), slices=1)
+    assert all(np.isfinite(floor) for floor in evaluation.floor.values())
+
+
 def test_white_noise_scores_far_above_one():
     evaluation = evaluate(
         EXEMPLAR, lambda points, seed: np.random.default_rng(seed).random((len(points), 3), np.float32), slices=2
@@ -58,11 +66,12 @@ def test_the_command_measures_a_bundle_and_writes_its_card(solidgrain, toy_folde
     import OpenImageIO as oiio
 
     folder = shutil.copytree(toy_folder, tmp_path / "toy")
-    oiio.ImageBuf(EXEMPLAR).write(str(tmp_path / "exemplar.png"), oiio.UINT8)
+    oiio.ImageBuf(np.ascontiguousarray(EXEMPLAR[:64, :64])).write(str(tmp_path / "exemplar.png"), oiio.UINT8)
     outcome = solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
     assert outcome.code == 0, outcome.err
     assert "| vgg_frechet |" in outcome.out
     assert outcome.out.strip() in (folder / "card.md").read_text()
+    assert "Copying: patches are" in outcome.out
     solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
     assert (folder / "card.md").read_text().count("## Quality") == 1
 
@@ -75,3 +84,9 @@ def test_the_command_refuses_what_it_cannot_measure(solidgrain, toy_folder, tmp_
     outcome = solidgrain("evaluate", toy_folder, "--exemplar", tmp_path / "small.png", *flags)
     assert outcome.code == code
     assert message in outcome.err
+
+
+def test_inception_weights_that_are_missing_are_noticed_before_measuring(solidgrain, toy_folder, tmp_path):
+    outcome = solidgrain("evaluate", toy_folder, "--exemplar", tmp_path / "none.png", "--inception", tmp_path / "none.pth")
+    assert outcome.code == 1
+    assert "none.pth: no such file" in outcome.error

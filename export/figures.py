@@ -1,0 +1,41 @@
+"""What an evaluation found, as a table for people: for the terminal, the model card and the sheet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from solidgrain.train.copying import Copying
+    from solidgrain.train.quality import Evaluation
+
+
+@dataclass(frozen=True)
+class Figures:
+    """A table with a sentence before it and one after it."""
+
+    before: str
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    after: str
+
+    def markdown(self) -> str:
+        lines = [self.header, ("---",) * len(self.header), *self.rows]
+        table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines).replace(" --- ", "---")
+        return f"{self.before}\n\n{table}\n\n{self.after}"
+
+
+def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
+    rows = []
+    for name, floor in evaluation.floor.items():
+        spreads = (evaluation.axis[name], evaluation.oblique[name])
+        rows.append((name, f"{floor:.4g}", *(f"{mean:.2f} ± {deviation:.2f}" for mean, deviation in spreads)))
+    return Figures(
+        f"Distances to the exemplar over its own floor, mean ± standard deviation over {evaluation.slices} slices of "
+        f"{evaluation.crop}² pixels, through the runtime:",
+        ("measure", "floor", "axis-aligned slices", "oblique slices"),
+        rows,
+        f"Copying: patches are {copying.ratio:.2f} times as far from the exemplar as its halves are from each other, and "
+        f"{100 * copying.closer:.1f} % of {copying.patches} come nearer than 99 % of those do "
+        "(near 1 and 1 %: nothing is copied).",
+    )

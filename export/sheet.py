@@ -1,0 +1,185 @@
+"""An evaluation to look at: the exemplar beside slices of the texture, the patches nearest to the exemplar, and the figures.
+
+All slices have the exemplar's scale, but for one that covers twice the width. A sheet is one file: a PNG, or HTML with its
+pictures inside. The same texture and exemplar give the same bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import struct
+import textwrap
+import zlib
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from solidgrain.export.figures import Figures
+from solidgrain.runtime.errors import SolidgrainError
+from solidgrain.runtime.files import replacing
+from solidgrain.train.copying import Pair
+from solidgrain.train.cuts import Sample, axis_rotation, cut, oblique_rotation, random_place
+from solidgrain.train.exemplar import FloatArray
+
+Pixels = npt.NDArray[np.uint8]  # [H, W, 3]
+
+PANEL = 256  # pixels along each side of a picture: at most of the exemplar, at least on the sheet
+ENLARGED = 6  # screen pixels per pixel of a patch
+GAP, LINE, LETTER = 16, 24, 15  # screen pixels between pictures, from one line of text to the next, and of a letter's height
+LABELS, TABLE = "DroidSans", "DroidSansMono"  # fonts that OpenImageIO brings along
+COLUMN = 22  # letters
+STYLE = """
+body { font: 15px sans-serif; margin: 2em; max-width: 1150px }
+figure { display: inline-block; margin: 0 1em 1em 0 }
+img { display: block; image-rendering: pixelated }
+td, th { padding: 0.2em 1em; text-align: left; border-bottom: 1px solid #ccc }
+"""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Pictures with their labels, row by row, and the figures."""
+
+    title: str
+    rows: list[list[tuple[str, Pixels]]]
+    figures: Figures
+
+
+def make_sheet(name: str, exemplar: FloatArray, sample: Sample, grain: str, pairs: list[Pair], figures: Figures) -> Sheet:
+    """Draw everything that a sheet shows."""
+    size = min(*exemplar.shape[:2], PANEL)
+    top, left = ((extent - size) // 2 for extent in exemplar.shape[:2])
+    wide = _slices(sample, 2 * size, grain, axis=True)[0].reshape(size, 2, size, 2, 3).mean((1, 3))
+    rows = [
+        [("exemplar", exemplar[top : top + size, left : left + size])]
+        + [(f"axis-aligned slice {i}", one) for i, one in enumerate(_slices(sample, size, grain, axis=True), 1)],
+        [("twice the width", wide)]
+        + [(f"oblique slice {i}", one) for i, one in enumerate(_slices(sample, size, grain, axis=False), 1)],
+    ]
+    scale = -(-PANEL // size)
+    shown = [[(label, _enlarged(picture, scale)) for label, picture in row] for row in rows]
+    border = np.ones((len(pairs[0].patch), 1, 3), np.float32)
+    patches = [(f"{pair.distance:.4f}", np.hstack([pair.patch, border, pair.nearest])) for pair in pairs]
+    enlarged = [(label, _enlarged(picture, ENLARGED)) for label, picture in patches]
+    half = len(enlarged) // 2
+    return Sheet(f"{name}, and its exemplar", [*shown, enlarged[:half], enlarged[half:]], figures)
+
+
+def write_sheet(path: Path, sheet: Sheet) -> None:
+    """Write a sheet, as HTML or as PNG by the path's suffix. Raises SolidgrainError if that cannot be done."""
+    content = as_html(sheet).encode() if path.suffix.lower() == ".html" else as_png(_drawn(sheet))
+    try:
+        with replacing(path) as file:
+            file.write(content)
+    except OSError as error:
+        raise SolidgrainError(f"--sheet {path}: cannot write ({error.strerror})") from error
+
+
+def _slices(sample: Sample, size: int, grain: str, axis: bool) -> list[FloatArray]:
+    """Three slices of as many instances, at fixed random places."""
+    slices = []
+    for seed in range(3):
+        generator = torch.Generator().manual_seed(seed)
+        rotation = axis_rotation(seed, grain) if axis else oblique_rotation(generator, grain)
+        slices.append(cut(sample, size, rotation, seed, random_place(generator)))
+    return slices
+
+
+def _enlarged(picture: FloatArray, scale: int) -> Pixels:
+    """8-bit pixels, each drawn `scale` times as wide and high."""
+    pixels = np.round(picture.clip(0, 1) * 255).astype(np.uint8)
+    return pixels.repeat(scale, 0).repeat(scale, 1)
+
+
+PAIRS = "The patches that come nearest to the exemplar, each beside what is nearest there, and their distance:"
+
+
+def as_html(sheet: Sheet) -> str:
+    """The sheet as one page that needs no other file."""
+
+    def figure(label: str, pixels: Pixels) -> str:
+        data = base64.b64encode(as_png(pixels)).decode()
+        return f'<figure><img alt="{label}" src="data:image/png;base64,{data}"><figcaption>{label}</figcaption></figure>'
+
+    def cells(kind: str, row: tuple[str, ...]) -> str:
+        return "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row) + "</tr>"
+
+    rows = ["<div>" + "\n".join(figure(*one) for one in row) + "</div>" for row in sheet.rows]
+    figures, title = sheet.figures, escape(sheet.title)
+    body = [f"<h1>{title}</h1>", *rows[:2], f"<p>{PAIRS}</p>", *rows[2:], f"<p>{escape(figures.before)}</p>", "<table>"]
+    body += [cells("th", figures.header), *(cells("td", row) for row in figures.rows), "</table>"]
+    body.append(f"<p>{escape(figures.after)}</p>")
+    head = f'<meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+    return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n' + "\n".join(body) + "\n</body></html>\n"
+
+
+def as_png(pixels: Pixels) -> bytes:
+    """An 8-bit RGB image as the bytes of a PNG file (PNG specification, third edition), the same ones every time."""
+    height, width = pixels.shape[:2]
+    lines = np.zeros((height, 1 + 3 * width), np.uint8)  # each line begins with its filter: 0, none
+    lines[:, 1:] = pixels.reshape(height, -1)
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"sRGB", b"\0"), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b""))
+    framed = [struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(framed)
+
+
+def _drawn(sheet: Sheet) -> Pixels:
+    """The sheet as one picture."""
+    figures = sheet.figures
+    table = ["".join(cell.ljust(COLUMN) for cell in row) for row in (figures.header, *figures.rows)]
+    width = max(sum(picture.shape[1] + GAP for _, picture in row) for row in sheet.rows) + GAP
+    page = Page(width)
+    page.write([sheet.title], LABELS)
+    for row in sheet.rows[:2]:
+        page.show(row)
+    page.write([PAIRS], LABELS)
+    for row in sheet.rows[2:]:
+        page.show(row)
+    letters = width // 8
+    page.write(textwrap.wrap(figures.before, letters), LABELS)
+    page.write(table, TABLE)
+    page.write(textwrap.wrap(figures.after, letters), LABELS)
+    return page.pixels()
+
+
+class Page:
+    """A white page that grows downwards."""
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        self.parts = [self._blank(GAP)]
+
+    def write(self, lines: list[str], font: str) -> None:
+        self.parts += [self._lettered([(GAP, line)], font) for line in lines] + [self._blank(GAP // 2)]
+
+    def show(self, row: list[tuple[str, Pixels]]) -> None:
+        """Pictures of one height side by side, their labels under them."""
+        strip, places, left = self._blank(len(row[0][1])), [], GAP
+        for label, picture in row:
+            strip[:, left : left + picture.shape[1]] = picture
+            places.append((left, label))
+            left += picture.shape[1] + GAP
+        self.parts += [strip, self._lettered(places, LABELS), self._blank(GAP // 2)]
+
+    def pixels(self) -> Pixels:
+        return np.concatenate(self.parts)
+
+    def _blank(self, height: int) -> Pixels:
+        return np.full((height, self.width, 3), 255, np.uint8)
+
+    def _lettered(self, places: list[tuple[int, str]], font: str) -> Pixels:
+        """A line of text: black words, each from its own left."""
+        import OpenImageIO as oiio
+
+        buffer = oiio.ImageBuf(self._blank(LINE))
+        for left, text in places:
+            if not oiio.ImageBufAlgo.render_text(buffer, left, LINE - 7, text, LETTER, font, (0.0, 0.0, 0.0)):
+                reason = buffer.geterror().strip()
+                raise SolidgrainError(f"--sheet: this OpenImageIO cannot draw text ({reason}); write a FILE.html instead")
+        drawn: Pixels = np.asarray(buffer.get_pixels(oiio.UINT8))
+        return drawn

@@ -1,0 +1,195 @@
+"""What the long comparisons share: trainings that may be cut short at any moment, and results that are kept as they come.
+
+OUT/plan.json is what was asked for. A finished cell is a JSON file that appears whole or not at all; an unfinished one is a run
+directory that goes on where its last sitting ended. Starting again with --resume therefore loses `SITTING` minutes at most.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import torch
+from torch import Tensor
+
+from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive
+from solidgrain.runtime.errors import SolidgrainError, TrainingError, UsageError
+from solidgrain.runtime.files import replacing
+from solidgrain.runtime.noise import noise_offsets, noise_tables
+from solidgrain.runtime.provider import usable_threads
+from solidgrain.train.cuts import Sample
+from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.inception import Inception
+from solidgrain.train.loop import train
+from solidgrain.train.run import Run, Source, create_run, open_run
+from solidgrain.train.sampler import make_sampler
+from solidgrain.train.settings import Budget, Settings
+from solidgrain.train.slices import UNIT, flat_slice
+from solidgrain.train.vgg import find_weights
+
+SITTING = 5.0  # minutes of training between checkpoints
+CHUNK = 1 << 16  # points at a time
+PLAN = "plan.json"
+
+
+def arguments_of(what: str, out: Path, slices: int) -> argparse.ArgumentParser:
+    """The flags of every comparison."""
+    parser = argparse.ArgumentParser(description=what)
+    budget = parser.add_mutually_exclusive_group(required=True)
+    budget.add_argument("--minutes", type=parse_minutes, metavar="M", help="of training for each cell")
+    budget.add_argument("--iterations", type=parse_positive, metavar="N", help="of training for each cell")
+    parser.add_argument(
+        "--slices", type=parse_positive, default=slices, metavar="N", help=f"to measure of each kind ({slices})"
+    )
+    parser.add_argument("--threads", type=parse_count, default=0, metavar="T", help="0: every processor (0)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train and sample (cpu)")
+    parser.add_argument(
+        "--inception", type=Path, metavar="FILE", help="InceptionV3 weights (pt_inception-*.pth): SIFID as well"
+    )
+    parser.add_argument("--out", type=Path, default=out, metavar="FOLDER", help=f"results and runs ({out})")
+    parser.add_argument("--resume", action="store_true", help="keep what FOLDER holds of the same comparison and go on")
+    return parser
+
+
+def prepare(arguments: argparse.Namespace, **asked: Any) -> tuple[torch.device, Inception | None]:
+    """Check all that can be checked before hours of training, and write or compare the plan."""
+    find_weights()
+    inception = Inception(arguments.inception) if arguments.inception else None
+    if arguments.device == "cuda" and not torch.cuda.is_available():
+        raise UsageError("--device cuda: torch sees no CUDA device; use --device cpu")
+    torch.set_num_threads(arguments.threads or usable_threads())
+    plan = {**{name: getattr(arguments, name) for name in ("minutes", "iterations", "slices", "device")}, **asked}
+    plan["sifid"] = inception is not None
+    found = kept(arguments.out / PLAN)
+    if found is not None and not arguments.resume:
+        raise UsageError(f"--out {arguments.out}: holds results already; go on with --resume, or choose another folder")
+    if found is not None and found != plan:
+        other = sorted(name for name in {*plan, *found} if plan.get(name) != found.get(name))
+        raise UsageError(f"--resume {arguments.out}: was started with other {', '.join(other)}; choose another --out")
+    keep(arguments.out / PLAN, plan)
+    return torch.device(arguments.device), inception
+
+
+def kept(path: Path) -> dict[str, Any] | None:
+    """A finished result, None if there is none."""
+    if not path.exists():
+        return None
+    result: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    return result
+
+
+def keep(path: Path, result: Mapping[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write(json.dumps(result, indent=2, ensure_ascii=False).encode() + b"\n")
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A run that has spent its budget, or that diverged before."""
+
+    run: Run
+    iterations: int
+    minutes: float
+    diverged: str  # why it stopped early, or ""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        return {"iterations": self.iterations, "minutes": round(self.minutes, 2), "diverged": self.diverged}
+
+
+def trained(folder: Path, settings: Settings, exemplar: FloatArray, budget: Budget, device: torch.device) -> Trained:
+    """Train in a folder, or go on there. A run that diverges stays at its last checkpoint, which is a result, too."""
+    if (folder / "options.json").exists():
+        run = open_run(folder)
+        if run.settings != settings or not np.array_equal(run.exemplar, exemplar):
+            raise UsageError(f"{folder}: a run with other settings or another exemplar; choose another --out")
+    else:
+        run = create_run(folder, settings, exemplar, Source(folder.parent.name, "", ""), budget)
+    diverged = ""
+    try:
+        for sitting in _sittings(budget, _spent(run)[1]):
+            train(run, sitting, device, on_warning=say)
+    except TrainingError as error:
+        if "diverged" not in str(error):
+            raise
+        diverged = str(error)
+    return Trained(run, *_spent(run), diverged)
+
+
+def _sittings(budget: Budget, minutes: float) -> list[Budget]:
+    """The budget in sittings, each of which ends with a checkpoint."""
+    if budget.minutes is None:
+        return [budget]
+    between = np.arange(minutes + SITTING, budget.minutes, SITTING)
+    return [*(Budget(budget.iterations, float(until)) for until in between), budget]
+
+
+def _spent(run: Run) -> tuple[int, float]:
+    """Iterations and minutes of the last checkpoint."""
+    state = run.load_checkpoint()
+    return (0, 0.0) if state is None else (state["iteration"], state["seconds"] / 60)
+
+
+def sampling(run: Run, device: torch.device) -> Sample:
+    """The run's averaged sampler as a function of points in exemplar pixels and a seed, with the runtime's noise.
+
+    In torch, since bundles cannot hold every variant. Points are moved to the origin first, where float32 coordinates are
+    exact enough: a texture is the same everywhere.
+    """
+    state = run.load_checkpoint()
+    if state is None:
+        raise TrainingError(f"{run.folder}: no checkpoint to measure")
+    sampler = make_sampler(run.settings, torch.Generator(device))
+    sampler.load_state_dict(state["average"])
+    instance: dict[int, Tensor] = {}
+
+    @torch.no_grad()
+    def sample(points: np.ndarray[Any, np.dtype[np.float64]], seed: int) -> FloatArray:
+        if seed not in instance:
+            instance.clear()
+            instance[seed] = torch.from_numpy(noise_tables(seed, run.settings.octaves)).to(device)
+            sampler.offsets = torch.from_numpy(noise_offsets(seed, run.settings.octaves)).float().to(device)
+        near = torch.from_numpy((points - points.mean(0)) / UNIT).float().to(device)
+        rgb = torch.cat([sampler(instance[seed], chunk[None])[0] for chunk in torch.split(near, CHUNK)])
+        found: FloatArray = rgb.clamp(0, 1).cpu().numpy()
+        return found
+
+    return sample
+
+
+def plane(size: int, rotation: Tensor, middle: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """The points [size², 3] of a square turned about its middle, in exemplar pixels."""
+    flat = flat_slice(size, torch.device("cpu")).double() * UNIT - torch.tensor([size / 2, size / 2, 0.0])
+    return np.asarray((flat @ rotation.double().T).numpy() + middle)
+
+
+def write_png(path: Path, image: FloatArray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    oiio.ImageBuf(np.ascontiguousarray(image, np.float32)).write(os.fspath(path), oiio.UINT8)
+
+
+def say(text: str) -> None:
+    """Progress: to stderr, at once."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def reported(main: Callable[[], None]) -> int:
+    """Run a comparison; what a user can mend is one line, and everything finished stays finished."""
+    try:
+        main()
+    except SolidgrainError as error:
+        say(f"error: {error}")
+        return 2 if isinstance(error, UsageError) else 1
+    except KeyboardInterrupt:
+        say("stopped; the same command with --resume goes on")
+        return 130
+    return 0
