@@ -1,4 +1,4 @@
-"""Running a plan: slabs are evaluated in order and handed to every writer, one slab ahead of them.
+"""Running a plan: slabs are evaluated in order and handed to every writer, at most two slabs ahead of them.
 
 What writers make of the slabs gathers in a staging folder beside each output. When all slabs are there the writers assemble
 their files, and only when all files of all outputs are whole are they put in place. A bake that was killed takes up what the
@@ -10,6 +10,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -25,6 +26,8 @@ from solidgrain.bake.writers import FloatArray, Output, Writer, open_writer
 from solidgrain.runtime import Texture
 from solidgrain.runtime.errors import BakeError
 from solidgrain.runtime.workers import Workers
+
+AHEAD = 2  # slabs that wait for the disk, at most, while the next is evaluated
 
 OnSlice = Callable[[int, int], None]  # slices done, slices in all
 Notes = list[dict[str, Any]]  # of complete files: see `Staging.finish`
@@ -179,12 +182,12 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _feed(plan: Plan, texture: Texture, jobs: Sequence[Job], workers: Workers, shard: Shard, on_slice: OnSlice) -> float:
-    """The slabs that any output lacks, to those that lack them: one is written while the next is evaluated.
+    """The slabs that any output lacks, to those that lack them: they are written while the next is evaluated.
 
     Returns the seconds spent in the sampler. `workers` are the writers': they are cancelled if anything goes wrong.
     """
     evaluation = 0.0
-    writing: Future[None] | None = None
+    writing: deque[Future[None]] = deque()
     done = [job.done for job in jobs]
     wanted = [z for z in range(*shard, plan.slab) if any(z not in slabs for slabs in done)]
     total, left = shard[1] - shard[0], sum(min(plan.slab, shard[1] - z) for z in wanted)
@@ -203,13 +206,13 @@ def _feed(plan: Plan, texture: Texture, jobs: Sequence[Job], workers: Workers, s
                 waiting_since = time.monotonic()
                 for z, slab in evaluate(plan, texture, first, stop):
                     evaluation += time.monotonic() - waiting_since
-                    if writing is not None:
-                        writing.result()
-                    writing = hand.submit(write, z, slab)
+                    if len(writing) == AHEAD:
+                        writing.popleft().result()
+                    writing.append(hand.submit(write, z, slab))
                     del slab  # or it would live while the next but one is made
                     waiting_since = time.monotonic()
-            if writing is not None:
-                writing.result()
+            for one in writing:
+                one.result()
         except BaseException:
             workers.cancel()  # or leaving would wait for all that they have begun
             raise

@@ -64,7 +64,7 @@ class Plan:
         """An upper estimate of resident bytes: the slab, what writers make of it, coordinates and file names, and the rest."""
         width, height, depth = self.size
         slice_bytes = width * height * 12
-        return BASE_MEMORY + 3 * self.slab * slice_bytes * self.samples + 64 * (width + height) + 1024 * depth
+        return BASE_MEMORY + 4 * self.slab * slice_bytes * self.samples + 64 * (width + height) + 1024 * depth
 
     def shard(self, number: int, count: int) -> tuple[int, int]:
         """The slices (first, stop) of shard `number` of `count`, counted from 1: whole slabs, none twice."""

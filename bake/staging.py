@@ -15,6 +15,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -172,11 +173,13 @@ def is_begun(output: Path) -> bool:
 
 
 def staged_bytes(output: Path) -> int:
-    """The bytes that an earlier bake has left in the staging of an output."""
+    """The bytes that an earlier bake has left in the staging of an output, without those that must be copied once more:
+    the streams of all shards but the first."""
     total = 0
     for path in staging_folder(output).glob("*"):
-        with suppress(FileNotFoundError):  # another shard's temporary file
-            total += path.stat().st_size
+        if not re.search(r"\.(?!0{9}$)\d{9}$", path.name):
+            with suppress(FileNotFoundError):  # another shard's temporary file
+                total += path.stat().st_size
     return total
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from solidgrain.bake.baker import bake, merge
-from solidgrain.bake.staging import open_staging, staging_folder
+from solidgrain.bake.staging import open_staging, staged_bytes, staging_folder
 from solidgrain.bake.writers import PREVIEW, make_output
 from solidgrain.runtime import BakeError
 from tests.bake.test_writers import SIZE, plan_for
@@ -139,6 +139,14 @@ def test_a_shard_without_slabs_is_done_at_once_whoever_works_beside_it(toy, tmp_
     with closing(open_staging(output.path, plan.work(output), SIZE[2], 0, (0, 16), fresh=False)):
         assert plan.shard(1, 3) == (0, 0)
         assert bake(plan, toy, shard=(0, 0)).files == []
+
+
+def test_the_disk_must_have_room_for_what_a_merge_copies(toy, tmp_path):
+    plan = plan_for(toy, *outputs(tmp_path, ("a.npy",)), size=(16, 16, 64))
+    for number in (1, 2, 3, 4):
+        bake(plan, toy, shard=plan.shard(number, 4))
+    first = 16 * 16 * 16 * 12 + 128
+    assert first < staged_bytes(tmp_path / "a.npy") < first + 8192  # journals and the plan besides
 
 
 def test_many_shards_are_whole_slabs_and_cover_every_slice_once(toy):

@@ -13,6 +13,8 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 import pyvista
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
 from solidgrain.bake.baker import bake
 from solidgrain.bake.color import to_linear
@@ -106,6 +108,44 @@ def test_vti_read_by_vtk_at_the_sampled_point(baked, toy, name, tolerance, x, y,
     scale = 255 if name == "toy.vti" else 1
     np.testing.assert_allclose(image.point_data["rgb"][index] / scale, expected(toy, x, y, z), atol=tolerance)
     assert image.field_data["color_encoding"] == ["srgb_rec709_scene"]
+
+
+@pytest.mark.parametrize("compression", ["none", "zip", "zips", "piz", "dwaa"])
+@pytest.mark.parametrize("kind", ["half", "float"])
+def test_every_exr_compression_is_read_by_openimageio(toy, tmp_path, kind, compression):
+    bake(plan_for(toy, make_output(tmp_path / "a.####.exr", type=kind, compression=compression, start=0)), toy)
+    image = oiio.ImageBuf(os.fspath(tmp_path / "a.0017.exr"))
+    assert image.spec().format == (oiio.HALF if kind == "half" else oiio.FLOAT)
+    assert image.spec()["compression"].startswith(compression)
+    level = toy.grid(SIZE[::-1], seed=7, origin=ORIGIN, spacing=SPACING)[17]
+    tolerance = 0.02 if compression == "dwaa" else 6e-4 if kind == "half" else 1e-6
+    np.testing.assert_allclose(image.get_pixels(oiio.FLOAT), to_linear(level), atol=tolerance)
+
+
+def test_exr_channels_have_the_names_and_contents_asked_for(toy, tmp_path):
+    channels = "albedo.R=r,albedo.G=g,albedo.B=b,A=one,height=luma"
+    bake(plan_for(toy, make_output(tmp_path / "a.####.exr", type="float", channels=channels)), toy)
+    image = oiio.ImageBuf(os.fspath(tmp_path / "a.0004.exr"))
+    found = dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), -1, 0), strict=True))
+    level = to_linear(toy.grid(SIZE[::-1], seed=7, origin=ORIGIN, spacing=SPACING)[3])
+    for k, name in enumerate(("albedo.R", "albedo.G", "albedo.B")):
+        np.testing.assert_allclose(found[name], level[..., k], atol=1e-6)
+    np.testing.assert_allclose(found["height"], level @ np.array([0.2126, 0.7152, 0.0722]), atol=1e-5)
+    assert (found["A"] == 1).all()
+
+
+@pytest.mark.parametrize("compression", ["none", "zlib"])
+@pytest.mark.parametrize(("kind", "largest"), [("uint8", 255), ("uint16", 65535), ("float32", 1)])
+def test_every_kind_of_vti_is_read_by_vtk_whole_and_in_part(toy, tmp_path, kind, largest, compression):
+    bake(plan_for(toy, make_output(tmp_path / "a.vti", type=kind, compression=compression)), toy)
+    grid = toy.grid(SIZE[::-1], seed=7, origin=ORIGIN, spacing=SPACING)
+    whole = pyvista.read(tmp_path / "a.vti").point_data["rgb"].reshape(*SIZE[::-1], 3)
+    assert whole.dtype == kind
+    np.testing.assert_allclose(whole / largest, grid, atol=0.5 / largest + 1e-6 if largest > 1 else 0)
+    reader = vtkXMLImageDataReader(file_name=os.fspath(tmp_path / "a.vti"))
+    reader.UpdateExtent((0, SIZE[0] - 1, 0, SIZE[1] - 1, 11, 12))
+    part = vtk_to_numpy(reader.GetOutput().GetPointData().GetArray("rgb")).reshape(-1, *SIZE[1::-1], 3)
+    assert np.array_equal(part, whole[11:13])
 
 
 def test_npy_is_the_grid_bit_for_bit(baked, toy):
