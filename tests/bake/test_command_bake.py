@@ -179,9 +179,13 @@ def test_a_model_that_returns_nan_leaves_nothing_behind(solidgrain, tmp_path):
     assert list((tmp_path / "out").iterdir()) == []
 
 
+# Shells let the jobs that they start in the background ignore Ctrl-C, and children inherit it.
+HEEDING = ("env", "--default-signal=INT")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_leaves_nothing_behind_and_exits_with_130(tmp_path, toy_folder, number):
-    command = [sys.executable, "-m", "solidgrain.bake.cli", "bake", toy_folder, "--size", "512", "--quiet"]
+    command = [*HEEDING, sys.executable, "-m", "solidgrain.bake.cli", "bake", toy_folder, "--size", "512", "--quiet"]
     outputs = ["--out", tmp_path / "a.####.exr", "--out", tmp_path / "a.vti", "--out", tmp_path / "a.npy"]
     process = subprocess.Popen([*map(str, command), *map(str, outputs)], stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60

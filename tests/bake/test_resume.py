@@ -19,6 +19,7 @@ from solidgrain.bake.baker import bake, merge
 from solidgrain.bake.staging import open_staging, staged_bytes, staging_folder
 from solidgrain.bake.writers import PREVIEW, make_output
 from solidgrain.runtime import BakeError
+from tests.bake.test_command_bake import HEEDING
 from tests.bake.test_writers import SIZE, plan_for
 
 NAMES = ("a.####.exr", "a.vti", "z.vti", "a.npy", "x.####.exr", "m.npy", "m.####.exr", "a.png")
@@ -381,7 +382,8 @@ def quick() -> dict[str, str]:
 
 
 def start(bundle: Path, folder: Path, *flags: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "solidgrain.bake.cli", "bake", str(bundle), "--quiet", "--out", "a.vti", *flags]
+    program = [*HEEDING, sys.executable, "-m", "solidgrain.bake.cli"]
+    command = [*program, "bake", str(bundle), "--quiet", "--out", "a.vti", *flags]
     return subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
 
 
