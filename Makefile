@@ -41,7 +41,7 @@ test-wheel: wheel
 	$(PYTHON) -m venv $(WHEEL_VENV)
 	$(WHEEL_VENV)/bin/python -m pip install --quiet "$$(ls dist/*.whl)[test]"
 	! $(WHEEL_VENV)/bin/python -c 'import torch' 2>/dev/null
-	$(WHEEL_VENV)/bin/python -m pytest tests/runtime tests/bake
+	$(WHEEL_VENV)/bin/python -m pytest -m 'not slow' tests/runtime tests/bake
 
 # The fused kernel under the address and undefined-behaviour sanitizers: its tests, every path that this machine has.
 SANITIZED := build/sanitized/_kernel.so
