@@ -16,21 +16,20 @@ from solidgrain.runtime import Texture
 
 def check_place(plan: Plan, texture: Texture) -> None:
     """Raises EvaluationError if the sampler cannot reach the grid, or cannot tile it."""
-    texture.grid_start(**_grid(plan)[1])
+    texture.grid_start(**_grid(plan))
 
 
-def _grid(plan: Plan) -> tuple[int, dict[str, Any]]:
-    """Samples along each axis of a voxel, and the grid of samples as the runtime's arguments."""
-    fine = round(plan.samples ** (1 / 3))
-    width, height, depth = (fine * extent for extent in plan.size)
-    spacing = [step / fine for step in plan.spacing]
+def _grid(plan: Plan) -> dict[str, Any]:
+    """The grid of samples as the runtime's arguments."""
+    width, height, depth = (plan.fine * extent for extent in plan.size)
+    spacing = [step / plan.fine for step in plan.spacing]
     place = {"origin": plan.origin, "spacing": spacing, "tile": plan.tile, "transform": plan.transform}
-    return fine, {"shape": (depth, height, width), **place}
+    return {"shape": (depth, height, width), **place}
 
 
 def evaluate(plan: Plan, texture: Texture, first: int, stop: int) -> Iterator[tuple[int, FloatArray]]:
     """Slices first .. stop - 1 as slabs, sRGB-encoded: pairs of first slice and [<= plan.slab, y, x, 3]."""
-    fine, grid = _grid(plan)
+    fine, grid = plan.fine, _grid(plan)
     shape = grid.pop("shape")
     slabs = texture.slabs(shape, plan.seed, slab=fine * plan.slab, slices=(fine * first, fine * stop), **grid)
     return slabs if fine == 1 else ((z // fine, _averaged(slab, fine, texture)) for z, slab in slabs)

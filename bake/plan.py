@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,11 @@ class Plan:
             seed=self.seed,
             tile=self.tile,
         )
+
+    @property
+    def fine(self) -> int:
+        """Samples along each axis of a voxel."""
+        return round(math.cbrt(self.samples))
 
     @property
     def slab(self) -> int:

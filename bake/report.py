@@ -61,8 +61,8 @@ def summary(report: dict[str, Any]) -> str:
 def tile_distortion(plan: Plan, texture: Texture) -> list[float] | None:
     """By how much tiling moved each octave, relative to its transform; None without tiling."""
     tiling = texture.tiling(
-        [extent * round(plan.samples ** (1 / 3)) for extent in plan.volume.shape],
-        spacing=[step / round(plan.samples ** (1 / 3)) for step in plan.spacing],
+        [extent * plan.fine for extent in plan.volume.shape],
+        spacing=[step / plan.fine for step in plan.spacing],
         tile=plan.tile,
         transform=plan.transform,
     )

@@ -48,11 +48,10 @@ class Record:
 
 
 class Finished(NamedTuple):
-    """A complete file in the store's folder, and where it belongs. Its checksum, if that is known."""
+    """A complete file in the store's folder, and where it belongs."""
 
     staged: Path
     final: Path
-    sha256: str = ""
 
 
 class Store:

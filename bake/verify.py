@@ -97,7 +97,7 @@ def compare(plan: Plan, output: Output, texture: Texture, count: int) -> tuple[i
 
 def evaluate_voxel(plan: Plan, texture: Texture, voxel: npt.NDArray[np.int64]) -> FloatArray:
     """The colour [3] of voxel (x, y, z) of a plan, sRGB-encoded, by itself."""
-    fine = round(plan.samples ** (1 / 3))
+    fine = plan.fine
     origin = [start + int(k) * step for start, k, step in zip(plan.origin, voxel, plan.spacing, strict=True)]
     samples = texture.grid(
         (fine, fine, fine),

@@ -1,6 +1,6 @@
 """The table of writers, from suffix to file format, and the little that all formats share."""
 
-from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer, replay
+from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
 from solidgrain.bake.writers.table import (
     PREVIEW,
     check_output,
@@ -32,7 +32,6 @@ __all__ = [
     "output_bytes",
     "output_exists",
     "output_files",
-    "replay",
     "scratch_bytes",
     "suffixes",
 ]

@@ -2,7 +2,7 @@
 
 Tiles are row-major, slice 0 at the top left; within a tile the top row is y = 0 and the left column x = 0 (a flipbook, as the
 volume importers of Unreal, Unity and Godot read it). PNG has 8 bits, EXR half floats in zip-compressed scanlines. Slices are
-spooled; the image is written and read back one row of tiles at a time.
+spooled; the image is written and read back a few rows of pixels at a time.
 """
 
 from __future__ import annotations
@@ -85,11 +85,15 @@ class AtlasFile(Writer):
         sync(staged)
         return [Finished(staged, self.output.path), write_sidecar(store, self._values(tiles), sidecar_path(self.output))]
 
+    def _thickness(self, tiles: Layout) -> int:
+        """Rows of pixels that are in memory at a time: at most those of a tile."""
+        return max(1, min(tiles.tile_height, BAND_BYTES // (tiles.width * 3 * self.dtype.itemsize)))
+
     def _bands(self, tiles: Layout, store: Store) -> Iterator[tuple[int, npt.NDArray[np.generic]]]:
         """The image from top to bottom, a few rows of pixels at a time: first row, [rows, width, 3]. A tile without a slice
         is black."""
         row_bytes = tiles.tile_width * 3 * self.dtype.itemsize
-        thickness = max(1, min(tiles.tile_height, BAND_BYTES // (row_bytes * tiles.columns)))
+        thickness = self._thickness(tiles)
         for tile_row in range(tiles.rows):
             for first in range(0, tiles.tile_height, thickness):
                 count = min(thickness, tiles.tile_height - first)
@@ -137,8 +141,9 @@ class AtlasFile(Writer):
     def _read(self, path: Path, tiles: Layout) -> str:
         """The checksum of the pixels that a file holds: OpenImageIO may report success on a full disk."""
         digest = hashlib.sha256()
-        starts = range(0, tiles.height, tiles.tile_height)
-        for band in self._scanlines(path, [(first, first + tiles.tile_height) for first in starts]):
+        thickness = self._thickness(tiles)
+        runs = [(first, min(first + thickness, tiles.height)) for first in range(0, tiles.height, thickness)]
+        for band in self._scanlines(path, runs):
             digest.update(band.data)
         return digest.hexdigest()
 

@@ -19,7 +19,8 @@ import pytest
 from solidgrain.bake.baker import bake
 from solidgrain.bake.color import LINEAR, SRGB, to_linear
 from solidgrain.bake.store import Store
-from solidgrain.bake.writers import Volume, check_output, make_output, open_writer, output_bytes, replay
+from solidgrain.bake.writers import Volume, check_output, make_output, open_writer, output_bytes
+from solidgrain.bake.writers.base import replay
 from solidgrain.runtime.errors import BakeError, UsageError
 from solidgrain.runtime.workers import Workers
 from tests.bake.test_writers import ORIGIN, SIZE, SPACING, VOXELS, expected, plan_for
