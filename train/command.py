@@ -1,4 +1,4 @@
-"""`solidgrain train`: a photograph becomes a run directory."""
+"""`solidgrain train`: a photograph, or a folder of them, becomes a run directory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import torch
 
     from solidgrain.train.loop import Report
-    from solidgrain.train.run import Run
+    from solidgrain.train.run import Run, RunFolder
     from solidgrain.train.settings import Budget, Settings
 
 INTERRUPTED = 130
@@ -33,6 +33,10 @@ FIXED = (
     "precision",
     "license",
     "credit",
+    "space",
+    "hold_out",
+    "skip_unreadable",
+    "warm_start",
 )  # what a run settles for good
 
 
@@ -42,6 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--out", type=Path, metavar="RUN", help="the run directory to make")
     where.add_argument("--resume", type=Path, metavar="RUN", help="go on with a run where its last checkpoint left it")
+    add("--space", type=Path, metavar="FOLDER", help="learn a texture space from all photographs of a folder")
+    add("--hold-out", metavar="N|FILE", help="of --space: exemplars never trained on, so many or those a file lists")
+    add("--skip-unreadable", action="store_true", default=None, help="of --space: leave out files that cannot be used")
+    add("--warm-start", type=Path, metavar="RUN", help="begin with the weights of another run, as far as they fit")
     add("--preset", choices=("fast", "paper"), help="fast: few CPU minutes; paper: the paper's settings (fast)")
     add(
         "--variant",
@@ -75,14 +83,18 @@ def run(arguments: argparse.Namespace) -> int:
 
     from solidgrain.runtime.provider import usable_threads
     from solidgrain.train.loop import train
+    from solidgrain.train.processes import join_processes, local_device
 
-    device = choose_device(arguments.device)
+    device = local_device(choose_device(arguments.device))
     torch.set_num_threads(arguments.threads or usable_threads())
-    training = resume(arguments) if arguments.resume else start(arguments)
+    processes = join_processes(device)
+    training = processes.one_after_another(lambda: begin(arguments, device, processes.first))
     stop = StopRequest()
-    progress = Progress(training.budget, arguments.quiet)
-    train(training, training.budget, device, progress.show, stop.requested, progress.warn)
+    progress = Progress(training.budget, arguments.quiet or not processes.first)
+    train(training, training.budget, device, progress.show, stop.requested, progress.warn, processes)
     folder = training.folder
+    if not processes.first:
+        return 0
     if stop.requested():
         print(f"stopped and saved; go on with: solidgrain train --resume {folder}", file=sys.stderr)
         return INTERRUPTED
@@ -93,6 +105,63 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def begin(arguments: argparse.Namespace, device: torch.device, first: bool) -> RunFolder:
+    """The run to train: the one to go on with, or a new one, which the first of several processes makes."""
+    from solidgrain.train.warm_start import warm_start
+
+    if arguments.resume:
+        return resume(arguments)
+    if not first:
+        return open_any(arguments.out)
+    training = start_space(arguments) if arguments.space else start(arguments)
+    if arguments.warm_start:
+        taken, left = warm_start(training, arguments.warm_start, device)
+        print(f"{arguments.warm_start}: took over {taken} of {taken + left} parameter tensors", file=sys.stderr)
+    return training
+
+
+def open_any(folder: Path) -> RunFolder:
+    """A run directory of either kind."""
+    from solidgrain.train.run import is_space, open_run
+    from solidgrain.train.space_run import open_space_run
+
+    return open_space_run(folder) if is_space(folder) else open_run(folder)
+
+
+def start_space(arguments: argparse.Namespace) -> RunFolder:
+    """A new run directory for a folder of photographs."""
+    from solidgrain.train.collection import read_members
+    from solidgrain.train.run import Source
+    from solidgrain.train.space_run import create_space_run
+
+    if arguments.exemplar is not None:
+        raise UsageError(f"--space {arguments.space}: learns from all its photographs; leave {arguments.exemplar} out")
+    settings = make_settings(arguments)
+    if arguments.anisotropic == "auto":
+        raise UsageError("--anisotropic: say x or y; the grain of all photographs of a --space must run the same way")
+    if arguments.anisotropic:
+        settings = replace(settings, grain=arguments.anisotropic)
+
+    def warn(line: str) -> None:
+        print(f"warning: {line}", file=sys.stderr)
+
+    smallest = max(settings.patch, settings.encoded_patch)
+    members = read_members(arguments.space, smallest, bool(arguments.skip_unreadable), warn)
+    source = Source("", arguments.license or "", arguments.credit or "")
+    budget = make_budget(arguments, settings)
+    return create_space_run(arguments.out, settings, members, held_out_names(arguments.hold_out), source, budget)
+
+
+def held_out_names(text: str | None) -> int | list[str]:
+    """How many exemplars to hold out, or which. Raises UsageError if it is neither a number nor a file."""
+    if text is None or text.isdecimal():
+        return int(text or 0)
+    try:
+        return [line.strip() for line in Path(text).read_text("utf-8").splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"--hold-out {text}: expected a number, or a file with a name per line ({error})") from error
+
+
 def start(arguments: argparse.Namespace) -> Run:
     """A new run directory for the photograph, with a warning if one texture cannot describe it."""
     from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity, read_photograph
@@ -100,7 +169,9 @@ def start(arguments: argparse.Namespace) -> Run:
     from solidgrain.train.vgg import find_weights
 
     if arguments.exemplar is None:
-        raise UsageError("no EXEMPLAR given; expected a photograph to learn from")
+        raise UsageError("no EXEMPLAR given; expected a photograph to learn from, or --space FOLDER")
+    if strange := [flag for flag in ("hold_out", "skip_unreadable") if getattr(arguments, flag) is not None]:
+        raise UsageError(f"--{strange[0].replace('_', '-')}: is about the photographs of a --space; leave it out")
     settings = make_settings(arguments)
     if settings.style_features == "vgg":
         find_weights()  # before there is a run directory
@@ -115,7 +186,7 @@ def start(arguments: argparse.Namespace) -> Run:
         )
     settings = with_grain(settings, arguments.anisotropic, exemplar)
     source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace)
-    return create_run(arguments.out, settings, exemplar, source, make_budget(arguments, settings.preset))
+    return create_run(arguments.out, settings, exemplar, source, make_budget(arguments, settings))
 
 
 def make_settings(arguments: argparse.Namespace) -> Settings:
@@ -127,7 +198,13 @@ def make_settings(arguments: argparse.Namespace) -> Settings:
     changes = {name: value for name, value in changes.items() if value is not None}
     if changes.get("patch", SMALLEST_PATCH) < SMALLEST_PATCH:
         raise UsageError(f"--patch {arguments.patch}: expected at least {SMALLEST_PATCH}")
-    return vary(preset(arguments.preset or "fast", **changes), arguments.variant or "paper")
+    kind = " space" if arguments.space else ""
+    settings = vary(preset((arguments.preset or "fast") + kind, **changes), arguments.variant or "paper")
+    if settings.batch % settings.group:
+        raise UsageError(f"--batch {settings.batch}: expected a multiple of {settings.group}, the patches per exemplar")
+    if settings.latent and settings.noise_at_input:
+        raise UsageError(f"--variant {settings.variant}: a texture space needs noise in the hidden layers; leave it out")
+    return settings
 
 
 def with_grain(settings: Settings, anisotropic: str | None, exemplar: Any) -> Settings:
@@ -142,23 +219,23 @@ def with_grain(settings: Settings, anisotropic: str | None, exemplar: Any) -> Se
     return replace(settings, grain=axis, grain_ratio=ratio)
 
 
-def resume(arguments: argparse.Namespace) -> Run:
+def resume(arguments: argparse.Namespace) -> RunFolder:
     """The run to go on with, under its own settings; --iterations and --minutes replace its budget."""
-    from solidgrain.train.run import open_run
-
     if arguments.exemplar is not None:
         raise UsageError(f"--resume {arguments.resume}: the run has its exemplar already; leave {arguments.exemplar} out")
-    if given := [f"--{name}" for name in FIXED if getattr(arguments, name) is not None]:
+    if given := [f"--{name.replace('_', '-')}" for name in FIXED if getattr(arguments, name) is not None]:
         raise UsageError(f"--resume {arguments.resume}: the run has settled {', '.join(given)} already; leave them out")
-    training = open_run(arguments.resume)
+    training = open_any(arguments.resume)
     if arguments.iterations is None and arguments.minutes is None:
         return training
-    return replace(training, budget=make_budget(arguments, training.settings.preset))
+    return replace(training, budget=make_budget(arguments, training.settings))
 
 
-def make_budget(arguments: argparse.Namespace, preset_name: str) -> Budget:
+def make_budget(arguments: argparse.Namespace, settings: Settings) -> Budget:
     """How long to train: what the flags say, or the preset's iterations."""
     from solidgrain.train.settings import PRESET_ITERATIONS, Budget
+
+    preset_name = settings.preset + (" space" if settings.latent else "")
 
     if arguments.iterations is None and arguments.minutes is None:
         return Budget(iterations=PRESET_ITERATIONS[preset_name])

@@ -90,17 +90,21 @@ def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generato
 
     An isotropic material looks the same turned by 90°, so its crops are also transposed by chance.
     """
-    size, transposed = settings.patch, settings.transposed and settings.grain == "none"
-    patches = []
+    size, patches = settings.patch, []
     for _ in range(settings.batch):
-        top, left = (_below(extent - size + 1, generator) for extent in exemplar.shape[1:])
-        crop = exemplar[:, top : top + size, left : left + size]
-        crop = crop.flip([axis for axis in (1, 2) if _below(2, generator)])
-        patches.append(crop.transpose(1, 2) if transposed and _below(2, generator) else crop)
+        top, left = (uniform_below(extent - size + 1, generator) for extent in exemplar.shape[1:])
+        patches.append(flip_by_chance(exemplar[:, top : top + size, left : left + size], settings, generator))
     return torch.stack(patches).contiguous(memory_format=torch.channels_last)
 
 
-def _below(bound: int, generator: torch.Generator) -> int:
+def flip_by_chance(crop: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:
+    """A crop [3, H, W], mirrored along each axis by chance, and transposed where the material has no grain."""
+    crop = crop.flip([axis for axis in (1, 2) if uniform_below(2, generator)])
+    transposed = settings.transposed and settings.grain == "none" and uniform_below(2, generator)
+    return crop.transpose(1, 2) if transposed else crop
+
+
+def uniform_below(bound: int, generator: torch.Generator) -> int:
     return int(torch.randint(bound, (), generator=generator, device=generator.device))
 
 

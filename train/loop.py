@@ -1,4 +1,4 @@
-"""The training loop (Sec. 3.1): one step of the critic, one of the sampler, and nothing hidden between them."""
+"""The training loop (Sec. 3.1, 3.2): one step of the critic, one of the sampler, and nothing hidden between them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,16 +15,15 @@ from torch import Tensor
 
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.train.critic import Critic
-from solidgrain.train.exemplar import draw_patches
 from solidgrain.train.losses import gradient_penalty, make_judge, style_loss
-from solidgrain.train.noise import draw_tables
 from solidgrain.train.preview import write_preview
-from solidgrain.train.run import CHECKPOINT, PARTS, Run
-from solidgrain.train.sampler import make_sampler
+from solidgrain.train.processes import Processes
+from solidgrain.train.run import CHECKPOINT, PARTS, RunFolder
 from solidgrain.train.settings import Budget, Settings, rate
-from solidgrain.train.slices import draw_slices
+from solidgrain.train.task import Batch, make_task
 from solidgrain.train.watch import Watch, flaw
 
+ALONE = Processes()
 MOST_SETBACKS = 2  # times that a diverged run goes back to its last checkpoint, before it gives up
 
 
@@ -42,62 +42,71 @@ class Report:
 class Trainer:
     """The state of a training: networks, optimisers, random streams. `train` drives it."""
 
-    def __init__(self, run: Run, device: torch.device) -> None:
-        self.run, self.settings, self.device = run, run.settings, device
+    def __init__(self, run: RunFolder, device: torch.device, processes: Processes = ALONE) -> None:
+        self.run, self.settings, self.device, self.processes = run, run.settings, device, processes
+        self.task = make_task(run, device)
         self.generator = torch.Generator(device).manual_seed(self.settings.seed)
-        self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
         self.critic = Critic(self.generator).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.judge = make_judge(self.settings, self.critic, device)
-        self.sampler = make_sampler(self.settings, self.generator)
+        self.sampler = self.task.make_model(self.generator)
         self.average = copy.deepcopy(self.sampler).requires_grad_(False)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), betas=(0.5, 0.999))
         self.sampler_optimiser = torch.optim.Adam(self.sampler.parameters(), betas=(0.5, 0.999))
         self.reduced_precision = use_bfloat16(self.settings, device)
         self.iteration, self.seconds = 0, 0.0
         self.watch, self.setbacks = Watch(), 0
+        if processes.rank:
+            self._draw_anew(processes.rank)  # the same networks everywhere, batches of one's own
 
     def step(self) -> Report:
         """One iteration: synthesise slices, improve the critic on them, then the sampler against it."""
         settings, started = self.settings, time.monotonic()
         self._set_rates()
-        fake = self.synthesise()  # (B, 3, patch, patch)
-        real = draw_patches(self.exemplar, settings, self.generator)
+        batch = self.task.draw(self.generator)
+        fake, real = self.synthesise(batch), batch.real  # (B, 3, patch, patch)
 
         critic_loss, penalty = torch.zeros(()), None
         if settings.trains_critic:
             critic_loss, penalty = self._critic_loss(real, fake.detach())
             self.critic_optimiser.zero_grad()
             torch.autograd.backward(critic_loss)
+            self.processes.average_gradients(self.critic.parameters())
             self.critic_optimiser.step()
 
         self.critic.requires_grad_(False)  # the sampler's step needs its activations, not its gradients
         style, adversarial = self._sampler_losses(real, fake)
         self.sampler_optimiser.zero_grad()
         torch.autograd.backward(settings.beta * style - settings.alpha * adversarial)
+        self.processes.average_gradients(self.sampler.parameters())
         self.sampler_optimiser.step()
         self.critic.requires_grad_(True)
 
         self._update_average()
         self.iteration += 1
-        self.seconds += time.monotonic() - started
+        return self._report(time.monotonic() - started, critic_loss, penalty, style, adversarial)
+
+    def _report(
+        self, elapsed: float, critic_loss: Tensor, penalty: Tensor | None, style: Tensor, adversarial: Tensor
+    ) -> Report:
+        """The losses as numbers, the same in all processes, so that all of them decide alike."""
+        found = (critic_loss, torch.zeros(()) if penalty is None else penalty, style, adversarial, torch.tensor(elapsed))
+        values = torch.stack([value.detach().double().to(self.device) for value in found])
+        critic_mean, penalty_mean, style_mean, adversarial_mean, taken = self.processes.mean(values).tolist()
+        self.seconds += taken
         return Report(
             iteration=self.iteration,
             seconds=self.seconds,
-            critic_loss=critic_loss.item(),
-            penalty=None if penalty is None else penalty.item(),
-            style=style.item(),
-            adversarial=adversarial.item(),
+            critic_loss=critic_mean,
+            penalty=None if penalty is None else penalty_mean,
+            style=style_mean,
+            adversarial=adversarial_mean,
         )
 
-    def synthesise(self) -> Tensor:
-        """A batch of random slices of one fresh noise instance, as images."""
-        settings = self.settings
-        tables = draw_tables(settings.octaves, settings.resolution, self.generator)
-        # Outside autocast: coordinates in bfloat16 are off by a tenth of a pixel.
-        points = draw_slices(settings, self.generator)
-        with self._autocast():
-            rgb: Tensor = self.sampler(tables, points)
-        return rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
+    def synthesise(self, batch: Batch) -> Tensor:
+        """The batch's slices, as images."""
+        with self._autocast():  # the points are made outside it: in bfloat16 they are off by a tenth of a pixel
+            rgb: Tensor = self.sampler(*batch.inputs)
+        return rgb.float().reshape(-1, self.settings.patch, self.settings.patch, 3).permute(0, 3, 1, 2)
 
     def _critic_loss(self, real: Tensor, fake: Tensor) -> tuple[Tensor, Tensor | None]:
         """L_D of Eq. 3 with the authors' drift term, and its gradient penalty alone when this iteration has one."""
@@ -118,7 +127,7 @@ class Trainer:
             with torch.no_grad():
                 _, of_real = self.judge(real)
         relative = self.settings.style_features == "vgg"
-        return style_loss(of_real, of_fake, self.settings.pooled_gram, relative), on_fake.float().mean()
+        return style_loss(of_real, of_fake, self.settings.gram_groups, relative), on_fake.float().mean()
 
     def _set_rates(self) -> None:
         s, lowered = self.settings, 0.5**self.setbacks
@@ -141,7 +150,11 @@ class Trainer:
         parts = {name: getattr(self, name).state_dict() for name in PARTS}
         progress = {"iteration": self.iteration, "seconds": self.seconds}
         caution = {"watch": self.watch.state(), "setbacks": self.setbacks}
-        self.run.save_checkpoint(parts | progress | caution | {"generator": self.generator.get_state()})
+        streams = self.processes.gathered(self.generator.get_state())
+        if self.processes.first:
+            random = {"generator": streams[0], "other_generators": streams[1:]}
+            self.run.save_checkpoint(parts | progress | caution | random)
+        self.processes.gathered(None)  # nobody goes on, and perhaps back to it, before it is there
 
     def load(self) -> None:
         """Take up the run's last checkpoint, if it has one."""
@@ -151,7 +164,7 @@ class Trainer:
         try:
             for name in PARTS:
                 getattr(self, name).load_state_dict(state[name])
-            self.generator.set_state(state["generator"])
+            self.generator.set_state(self._stream(state))
             self.watch = Watch(**state.get("watch", {}))  # runs of earlier versions have none
         except (RuntimeError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0]
@@ -159,9 +172,25 @@ class Trainer:
         self.iteration, self.seconds = state["iteration"], state["seconds"]
         self.setbacks = state.get("setbacks", 0)
 
+    def _stream(self, state: dict[str, Any]) -> Tensor:
+        """The state of this process's random stream. Raises TrainingError if the run has another number of processes."""
+        streams: list[Tensor] = [state["generator"], *state.get("other_generators", [])]
+        if len(streams) != self.processes.count:
+            raise TrainingError(
+                f"{self.run.folder}: saved by {len(streams)} processes, resumed by {self.processes.count}; expected the same"
+            )
+        return streams[self.processes.rank]
+
+    def _draw_anew(self, *numbers: int) -> None:
+        """Another random stream, a function of the run's seed and these numbers."""
+        stream = np.random.SeedSequence([self.settings.seed, *numbers])
+        self.generator.manual_seed(int(stream.generate_state(1, np.uint64)[0] >> 1))
+
+    @torch.no_grad()
     def flaw(self) -> str:
         """What makes the weights unfit for a checkpoint, or "" (see `watch.flaw`)."""
-        return flaw((self.critic, self.sampler, self.average), self.average, self.settings, self.exemplar)
+        probe = self.task.probe()
+        return flaw((self.critic, self.sampler, self.average), self.average(*probe.inputs), probe.exemplars)
 
     def gone_back(self, trouble: str) -> Trainer:
         """A trainer at the last checkpoint, or at the start, with half the rates and another random stream.
@@ -169,7 +198,7 @@ class Trainer:
         What it draws depends on the settings and on where it went back to, so that a run which is killed on the way does
         the same again. Raises TrainingError once `MOST_SETBACKS` are used up.
         """
-        again = Trainer(self.run, self.device)
+        again = Trainer(self.run, self.device, self.processes)
         again.load()
         if self.setbacks == MOST_SETBACKS:
             path = self.run.folder / CHECKPOINT
@@ -181,32 +210,35 @@ class Trainer:
                 f"fresh starts at lower rates; {way} train again with another --seed"
             )
         again.setbacks, again.seconds = self.setbacks + 1, self.seconds
-        stream = np.random.SeedSequence([self.settings.seed, again.iteration, again.setbacks])
-        again.generator.manual_seed(int(stream.generate_state(1, np.uint64)[0] >> 1))
-        self.run.rewind_stats(again.iteration)
+        rank = (self.processes.rank,) if self.processes.rank else ()
+        again._draw_anew(again.iteration, again.setbacks, *rank)
+        if self.processes.first:
+            self.run.rewind_stats(again.iteration)
         return again
 
 
 def train(
-    run: Run,
+    run: RunFolder,
     budget: Budget,
     device: torch.device,
     on_report: Callable[[Report], None] = lambda report: None,
     should_stop: Callable[[], bool] = lambda: False,
     on_warning: Callable[[str], None] = lambda line: None,
+    processes: Processes = ALONE,
 ) -> Report | None:
     """Train until the budget is spent or `should_stop` says so, from the run's last checkpoint if there is one.
 
     Leaves a checkpoint and a sample behind in either case. A training that diverges (`watch`) goes back to its last
     checkpoint, twice at most, and `on_warning` is told; then it raises TrainingError. No checkpoint is ever replaced by a
-    state that is in doubt.
+    state that is in doubt. Of several `processes`, all call this, and the first alone writes and reports.
     """
-    trainer = Trainer(run, device)
+    trainer = Trainer(run, device, processes)
     trainer.load()
-    run.rewind_stats(trainer.iteration)
+    if processes.first:
+        run.rewind_stats(trainer.iteration)
     settings, report = run.settings, None
 
-    while not budget.done(trainer.iteration, trainer.seconds) and not should_stop():
+    while not budget.done(trainer.iteration, trainer.seconds) and not processes.any(should_stop()):
         report = trainer.step()
         due = trainer.iteration % settings.checkpoint_every == 0
         style = report.style if settings.beta else 0.0  # where no one minimises it, it may grow as it likes
@@ -218,10 +250,10 @@ def train(
                 f"it goes on from iteration {trainer.iteration}, at half the rates"
             )
             continue
-        if trainer.iteration % settings.report_every == 0:
+        if trainer.iteration % settings.report_every == 0 and processes.first:
             run.append_stats(vars(report))
             on_report(report)
-        if trainer.iteration % settings.sample_every == 0:
+        if trainer.iteration % settings.sample_every == 0 and processes.first:
             _write_sample(trainer)
         if due and not trainer.watch.doubt():
             trainer.save()
@@ -229,7 +261,8 @@ def train(
         on_warning(f"iteration {trainer.iteration} is not saved ({doubt}); the last checkpoint stays")
     else:
         trainer.save()
-    _write_sample(trainer)
+    if processes.first:
+        _write_sample(trainer)
     return report
 
 
@@ -244,4 +277,4 @@ def use_bfloat16(settings: Settings, device: torch.device) -> bool:
 
 def _write_sample(trainer: Trainer) -> None:
     path = trainer.run.folder / "samples" / f"{trainer.iteration:06d}.png"
-    write_preview(path, trainer.average, trainer.settings, trainer.run.exemplar, trainer.device)
+    write_preview(path, trainer.average, trainer.settings, trainer.task.shown(), trainer.device)

@@ -41,24 +41,24 @@ def gradient_penalty(critic: Critic, real: Tensor, fake: Tensor, generator: torc
     return penalty
 
 
-def style_loss(real: Sequence[Tensor], fake: Sequence[Tensor], pooled: bool, relative: bool = False) -> Tensor:
+def style_loss(real: Sequence[Tensor], fake: Sequence[Tensor], groups: int, relative: bool = False) -> Tensor:
     """L_style of Eq. 4: the mean over layers of the mean absolute difference of Gram matrices.
 
     The Gram matrix is F F^T / pixels, the normalisation of the authors' code; the equation's 1 / (4 N² M²) differs from it
-    by a factor per layer. `pooled` averages the matrices over the batch before they are compared: all patches come from
-    one exemplar, and their mean is a less noisy target than any one patch. `relative` divides each layer's term by the mean
-    absolute entry of the real matrix, for features whose scale is not ours to train.
+    by a factor per layer. The batch is so many groups of consecutive patches, each of one exemplar: matrices are averaged
+    within a group before they are compared, for a mean is a less noisy target than any one patch. `relative` divides each
+    layer's term by the mean absolute entry of the real matrix, for features whose scale is not ours to train.
     """
     terms = []
     for of_real, of_fake in zip(real, fake, strict=True):
-        wanted, found = gram_matrix(of_real, pooled), gram_matrix(of_fake, pooled)
+        wanted, found = gram_matrices(of_real, groups), gram_matrices(of_fake, groups)
         difference = (wanted - found).abs().mean()
         terms.append(difference / wanted.abs().mean() if relative else difference)
     return torch.stack(terms).mean()
 
 
-def gram_matrix(activations: Tensor, pooled: bool) -> Tensor:
-    """Activations [B, C, H, W] -> Gram matrices [B, C, C], or their mean [C, C]; float32 whatever came in."""
+def gram_matrices(activations: Tensor, groups: int) -> Tensor:
+    """Activations [B, C, H, W] -> the mean Gram matrix of each group [groups, C, C]; float32 whatever came in."""
     flat = activations.float().flatten(2)
     gram: Tensor = flat @ flat.transpose(1, 2) / flat.shape[2]
-    return gram.mean(0) if pooled else gram
+    return gram.reshape(groups, -1, *gram.shape[1:]).mean(1)

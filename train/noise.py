@@ -10,8 +10,8 @@ from torch import Tensor
 def look_up(tables: Tensor, transforms: Tensor, points: Tensor, offsets: Tensor | None = None) -> Tensor:
     """Noise values at points.
 
-    tables [n, R, R, R] standard normal, indexed (x, y, z); transforms [n, 3, 3]; points [B, P, 3];
-    offsets [n, 3] texels, added to T_i p -> [B, P, n] float32.
+    tables [n, R, R, R] standard normal, indexed (x, y, z); transforms [n, 3, 3], or [B, n, 3, 3] where each image has its
+    own; points [B, P, 3]; offsets [n, 3] texels, added to T_i p -> [B, P, n] float32.
     Differentiable in `transforms`; the tables get no gradient.
 
     Always float32: under autocast the product T p would silently run in bfloat16 and be wrong by whole texels, which
@@ -19,7 +19,7 @@ def look_up(tables: Tensor, transforms: Tensor, points: Tensor, offsets: Tensor 
     """
     resolution = tables.shape[-1]
     with torch.autocast(points.device.type, enabled=False):
-        located = torch.einsum("nij,bpj->nbpi", transforms, points)
+        located = torch.einsum("nij,bpj->nbpi" if transforms.dim() == 3 else "bnij,bpj->nbpi", transforms, points)
         if offsets is not None:
             located = located + offsets[:, None, None]
         located = located - torch.floor(located.detach() / resolution) * resolution  # into [0, R): the tables repeat

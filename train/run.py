@@ -45,20 +45,13 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Run:
-    """A training's directory with what never changes during it."""
+class RunFolder:
+    """A training's directory with what never changes during it, whatever it is trained on."""
 
     folder: Path
     settings: Settings
-    source: Source
-    exemplar: FloatArray
     budget: Budget
     revision: str  # of solidgrain when the run was started
-
-    @property
-    def sha256(self) -> str:
-        """Of the exemplar's pixels."""
-        return hashlib.sha256(self.exemplar.tobytes()).hexdigest()
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace the checkpoint. Raises TrainingError if it cannot be written; the one before is then untouched."""
@@ -110,46 +103,86 @@ class Run:
             ) from error
 
 
+@dataclass(frozen=True)
+class Run(RunFolder):
+    """The training of a single exemplar."""
+
+    source: Source
+    exemplar: FloatArray
+
+    @property
+    def sha256(self) -> str:
+        """Of the exemplar's pixels."""
+        return pixels_sha256(self.exemplar)
+
+
 def create_run(folder: Path, settings: Settings, exemplar: FloatArray, source: Source, budget: Budget) -> Run:
     """A new run directory. Raises TrainingError if the folder already holds a run or cannot be written."""
-    if (folder / OPTIONS).exists():
-        raise TrainingError(f"{folder}: already holds a run; continue it with --resume {folder}, or choose another --out")
-    run = Run(folder, settings, source, exemplar, budget, source_revision())
-    options = {
-        "settings": settings_module.to_json(settings),
-        "source": vars(source),
-        "exemplar_sha256": run.sha256,
-        "budget": vars(budget),
-        "revision": run.revision,
-    }
-    try:
-        (folder / "samples").mkdir(parents=True, exist_ok=True)
+    run = Run(folder, settings, budget, source_revision(), source, exemplar)
+    with creating(folder):
         with replacing(folder / EXEMPLAR) as file:
             np.save(file, exemplar)
-        with replacing(folder / OPTIONS) as file:
-            file.write(json.dumps(options, indent=2).encode() + b"\n")
-    except OSError as error:
-        raise TrainingError(f"{folder}: cannot write the run directory ({error.strerror})") from error
+        write_options(run, {"source": vars(source), "exemplar_sha256": run.sha256})
     return run
 
 
 def open_run(folder: Path) -> Run:
-    """An existing run directory. Raises TrainingError if it is not one, or was tampered with."""
-    if not (folder / OPTIONS).is_file():
-        raise TrainingError(f"{folder}: not a run directory (no {OPTIONS}); expected a folder made by solidgrain train --out")
-    try:
-        options = json.loads((folder / OPTIONS).read_text("utf-8"))
-        settings = settings_module.from_json(options["settings"])
+    """The run directory of a single exemplar. Raises TrainingError if it is not one, or was tampered with."""
+    with opening(folder) as options:
+        if "exemplars" in options:
+            raise TrainingError(f"{folder}: the run of a texture space; expected one of a single exemplar")
         exemplar = np.load(folder / EXEMPLAR, allow_pickle=False)
-        run = Run(
-            folder, settings, Source(**options["source"]), exemplar, Budget(**options["budget"]), str(options["revision"])
-        )
+        run = Run(*common_options(folder, options), Source(**options["source"]), exemplar)
         intact = run.sha256 == options["exemplar_sha256"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
-        raise TrainingError(f"{folder}: damaged run directory ({error}); start the run again elsewhere") from error
     if not intact:
         raise TrainingError(f"{folder / EXEMPLAR}: not the pixels that the run was started with (sha256 differs)")
     return run
+
+
+def is_space(folder: Path) -> bool:
+    """Whether a run directory is a texture space's. Raises TrainingError if it is no run directory."""
+    with opening(folder) as options:
+        return "exemplars" in options
+
+
+@contextmanager
+def creating(folder: Path) -> Iterator[None]:
+    """A run directory in the making. Raises TrainingError if the folder already holds a run or cannot be written."""
+    if (folder / OPTIONS).exists():
+        raise TrainingError(f"{folder}: already holds a run; continue it with --resume {folder}, or choose another --out")
+    try:
+        (folder / "samples").mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise TrainingError(f"{folder}: cannot write the run directory ({error.strerror})") from error
+
+
+def write_options(run: RunFolder, specific: dict[str, Any]) -> None:
+    """What makes a folder a run directory; written last."""
+    settled = {"settings": settings_module.to_json(run.settings), **specific}
+    options = {**settled, "budget": vars(run.budget), "revision": run.revision}
+    with replacing(run.folder / OPTIONS) as file:
+        file.write(json.dumps(options, indent=2).encode() + b"\n")
+
+
+@contextmanager
+def opening(folder: Path) -> Iterator[dict[str, Any]]:
+    """The options of a run directory. Raises TrainingError if it is not one, or if what is read of it is damaged."""
+    if not (folder / OPTIONS).is_file():
+        raise TrainingError(f"{folder}: not a run directory (no {OPTIONS}); expected a folder made by solidgrain train --out")
+    try:
+        yield dict(json.loads((folder / OPTIONS).read_text("utf-8")))
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+        raise TrainingError(f"{folder}: damaged run directory ({error}); start the run again elsewhere") from error
+
+
+def common_options(folder: Path, options: dict[str, Any]) -> tuple[Path, Settings, Budget, str]:
+    """What every run's options hold, as the arguments of `RunFolder`."""
+    return folder, settings_module.from_json(options["settings"]), Budget(**options["budget"]), str(options["revision"])
+
+
+def pixels_sha256(pixels: np.ndarray[Any, Any]) -> str:
+    return hashlib.sha256(np.ascontiguousarray(pixels).tobytes()).hexdigest()
 
 
 def source_revision() -> str:

@@ -1,6 +1,8 @@
-"""The sampler S: noise octaves in, colour out (Sec. 3.1, Eq. 1 and 2)."""
+"""The sampler S: noise octaves in, colour out (Sec. 3.1, Eq. 1 and 2; conditioned on a texture, Sec. 3.2, Eq. 5)."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +13,18 @@ from solidgrain.train.settings import Settings
 
 HIDDEN_LAYERS = 5
 BINS = 4  # consecutive bins of octaves; bin l enters hidden layer l, the last hidden layer gets none
+
+
+class Condition(NamedTuple):
+    """What makes one sampler many textures: octaves and style of each image of a batch (Eq. 5)."""
+
+    transforms: Tensor  # [B, n, 3, 3], on coordinates in units of 64 pixels
+    gamma: Tensor  # [B, hidden layers, m]
+    delta: Tensor  # [B, hidden layers, m]
+
+    def repeated(self, times: int) -> Condition:
+        """Each texture for that many images in a row."""
+        return Condition(*(part.repeat_interleave(times, dim=0) for part in self))
 
 
 class Octaves(nn.Module):
@@ -28,9 +42,9 @@ class Octaves(nn.Module):
         """T_i [n, 3, 3], on coordinates in units of 64 pixels."""
         return self.directions * self.octave_scale
 
-    def noise(self, tables: Tensor, points: Tensor) -> Tensor:
-        """eta(c): tables [n, R, R, R], points [B, P, 3] -> [B, P, n]."""
-        return look_up(tables, self.transforms(), points, self.offsets)
+    def noise(self, tables: Tensor, points: Tensor, transforms: Tensor | None = None) -> Tensor:
+        """eta(c): tables [n, R, R, R], points [B, P, 3] -> [B, P, n], through `transforms` in place of its own if given."""
+        return look_up(tables, self.transforms() if transforms is None else transforms, points, self.offsets)
 
 
 class Sampler(Octaves):
@@ -46,15 +60,21 @@ class Sampler(Octaves):
         self.noise_weights = nn.Parameter(settings.noise_weight_start * noise_weights)  # A of Eq. 2, transposed
         self.output = Linear(m, 3, generator, gain=1.0)
 
-    def forward(self, tables: Tensor, points: Tensor) -> Tensor:
-        """Colour at points: tables [n, R, R, R], points [B, P, 3] -> rgb [B, P, 3], not clipped to [0, 1]."""
-        bins = self.noise(tables, points).chunk(BINS, dim=-1)  # (B, P, n / 4) each
+    def forward(self, tables: Tensor, points: Tensor, condition: Condition | None = None) -> Tensor:
+        """Colour at points: tables [n, R, R, R], points [B, P, 3] -> rgb [B, P, 3], not clipped to [0, 1].
+
+        Without a condition it is its own texture: its own T_i, no scale and no shift.
+        """
+        noise = self.noise(tables, points, condition and condition.transforms)
+        bins = noise.chunk(BINS, dim=-1)  # (B, P, n / 4) each
         x: Tensor = self.constant
         for layer, dense in enumerate(self.hidden):
             y: Tensor = dense(x)
             if layer < BINS:
                 y = y + bins[layer] @ self.noise_weights[layer]  # psi(eta) = A eta
             x = activate(y)
+            if condition is not None:  # y = gamma phi(W x + A eta + b) + delta
+                x = condition.gamma[:, layer, None].to(x.dtype) * x + condition.delta[:, layer, None].to(x.dtype)
         rgb: Tensor = self.output(x)
         return rgb
 

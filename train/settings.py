@@ -45,7 +45,12 @@ class Settings:
     penalty: float = 10.0  # lambda, weight of the gradient penalty
     penalty_every: int = 4  # iterations between penalties, each weighted that much more (lazy regularisation, StyleGAN2)
     drift: float = 0.001  # weight of E[D(r)^2] (gramgan/main.py; not in the paper)
-    pooled_gram: bool = True  # compare the Gram matrices of the whole batch, else patch by patch
+    pooled_gram: bool = True  # compare the mean Gram matrices of all patches of an exemplar, else patch by patch
+
+    # Texture space (Sec. 3.2)
+    latent: int = 0  # length of z; 0 for a single exemplar
+    encoded_patch: int = 128  # pixels along each side of the patch that E sees
+    group: int = 1  # consecutive patches of a batch that show one exemplar
 
     # Optimisation
     critic_rate: float = 2e-3
@@ -66,6 +71,13 @@ class Settings:
     def trains_critic(self) -> bool:
         """Whether any term of L_G needs D: with alpha = 0 it still learns, since L_style lives on its activations."""
         return self.alpha != 0 or self.style_features == "critic"
+
+    @property
+    def gram_groups(self) -> int:
+        """Groups of patches whose Gram matrices are compared: all of an exemplar's, or each patch alone."""
+        if not self.pooled_gram:
+            return self.batch
+        return self.batch // self.group if self.latent else 1
 
 
 @dataclass(frozen=True)
@@ -108,8 +120,17 @@ PAPER = Settings(
 )
 """The settings of the paper and of the authors' code: 128² patches, batch 16, T ~ N(0,1) 2^i, constant rates."""
 
-PRESETS = {"fast": FAST, "paper": PAPER}
-PRESET_ITERATIONS = {"fast": 2000, "paper": 100_000}
+SPACE: dict[str, Any] = {"octaves": 32, "latent": 32}
+"""What makes any settings those of a texture space (Sec. 4: "our conditional models use n = 32")."""
+
+PRESETS = {
+    "fast": FAST,
+    "paper": PAPER,
+    # Slower rates than for one exemplar: hours of training, and what is right for one texture is wrong for the next.
+    "fast space": replace(FAST, **SPACE, sampler_rate=1e-3, sampler_half_life=8000.0, critic_half_life=8000.0),
+    "paper space": replace(PAPER, **SPACE, octave_span=15.5),  # 2^(i/2)
+}
+PRESET_ITERATIONS = {"fast": 2000, "paper": 100_000, "fast space": 30_000, "paper space": 300_000}
 
 
 def preset(name: str, **changes: Any) -> Settings:

@@ -6,15 +6,12 @@ How the limit was chosen is in docs/training.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-
-from solidgrain.train.noise import draw_tables
-from solidgrain.train.settings import Settings
 
 LIMIT = 30.0  # times its lowest that the running mean of a loss may be
 SPIKE = 300.0  # times the lowest mean that a single loss may be: a mean alone is slow to show that an explosion has begun
@@ -22,7 +19,6 @@ PATIENCE = 100  # iterations beyond the limit in a row: it will not come back
 MEMORY = 10  # iterations, of the running means
 UNITS = {"L_style": 1e-3, "L_D": 1.0}  # added to the magnitudes: L_D crosses zero, and neither means much far below
 FLAT = 0.05  # of the exemplar's deviation: an average whose colours deviate less than that ignores its noise
-PLACES = 4096  # at which the average is looked at
 
 
 @dataclass
@@ -62,18 +58,15 @@ class Watch:
         return asdict(self)
 
 
-@torch.no_grad()
-def flaw(networks: Iterable[nn.Module], average: nn.Module, settings: Settings, exemplar: Tensor) -> str:
+def flaw(networks: Iterable[nn.Module], colors: Tensor, exemplars: Sequence[Tensor]) -> str:
     """What makes weights unfit for a checkpoint: NaN, infinity, or colours that hardly vary; "" if nothing does.
 
-    exemplar [3, H, W]. Looks at the average at far-apart places of one instance: those are as independent as instances.
+    colors [K, P, 3] are the average's, at far-apart places of K textures, exemplars [3, H, W] what these were learned from.
     """
     if not all(bool(torch.isfinite(tensor).all()) for network in networks for tensor in network.state_dict().values()):
         return "a weight is not finite"
-    generator = torch.Generator(exemplar.device).manual_seed(7)
-    tables = draw_tables(settings.octaves, settings.resolution, generator)
-    points = 64 * torch.rand(1, PLACES, 3, generator=generator, device=exemplar.device)
-    found, wanted = (float(colors.std(-1).mean()) for colors in (average(tables, points)[0].T, exemplar.flatten(1)))
+    wanted = float(torch.stack([exemplar.flatten(1).std(-1).mean() for exemplar in exemplars]).mean())
+    found = float(colors.std(1).mean())
     if found < FLAT * wanted:
         return f"the average has collapsed: its colours deviate by {found:.2g}, the exemplar's by {wanted:.2g}"
     return ""

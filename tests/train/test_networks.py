@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from solidgrain.train.critic import Critic
-from solidgrain.train.losses import gradient_penalty, gram_matrix, style_loss
+from solidgrain.train.losses import gradient_penalty, gram_matrices, style_loss
 from solidgrain.train.noise import look_up
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import FAST, PAPER, preset, rate
@@ -94,14 +94,14 @@ def test_penalty_is_zero_for_a_critic_of_slope_one():
 def test_gram_matrix_is_the_mean_product_of_channels():
     activations = torch.randn(2, 5, 4, 6, generator=generator())
     expected = torch.einsum("bihw,bjhw->bij", activations, activations) / 24
-    torch.testing.assert_close(gram_matrix(activations, pooled=False), expected)
-    torch.testing.assert_close(gram_matrix(activations, pooled=True), expected.mean(0))
+    torch.testing.assert_close(gram_matrices(activations, groups=len(activations)), expected)
+    torch.testing.assert_close(gram_matrices(activations, groups=1)[0], expected.mean(0))
 
 
 def test_style_loss_ignores_where_things_are():
     activations = torch.randn(2, 5, 8, 8, generator=generator())
-    assert style_loss([activations], [activations.roll(3, -1)], pooled=True).item() == pytest.approx(0, abs=1e-6)
-    assert style_loss([activations], [activations * 1.5], pooled=True).item() > 0.1
+    assert style_loss([activations], [activations.roll(3, -1)], groups=1).item() == pytest.approx(0, abs=1e-6)
+    assert style_loss([activations], [activations * 1.5], groups=1).item() > 0.1
 
 
 @pytest.mark.parametrize("rotations", ["uniform", "euler"])

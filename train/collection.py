@@ -1,0 +1,101 @@
+"""A folder of photographs: what a texture space is trained on, and what it is never shown (Sec. 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from solidgrain.runtime.errors import ExemplarError
+from solidgrain.train.exemplar import FloatArray, flip_by_chance, read_photograph, uniform_below
+from solidgrain.train.settings import Settings
+
+SUFFIXES = frozenset([".bmp", ".exr", ".hdr", ".jpeg", ".jpg", ".jxl", ".png", ".tga", ".tif", ".tiff", ".webp"])
+LEVELS = 65535  # exemplars are kept in 16 bits: half the memory, and no photograph has more
+WRAPS = 1.5  # times the step between neighbouring rows that the step across a seam may be
+
+
+@dataclass(frozen=True)
+class Member:
+    """One photograph of a collection."""
+
+    name: str  # its file's
+    pixels: npt.NDArray[np.uint16]  # [H, W, 3], sRGB-encoded; read from disk where it is needed
+    wraps: tuple[bool, bool]  # whether it continues across its edges, down and across
+    colorspace: str = ""  # what its colours were read as
+
+    @property
+    def exemplar(self) -> FloatArray:
+        """All of it, [H, W, 3] in [0, 1]."""
+        return np.asarray(self.pixels, np.float32) / np.float32(LEVELS)
+
+    def crop(self, size: int, generator: torch.Generator) -> Tensor:
+        """A random crop [3, size, size], across its edges where it continues there."""
+        ranges = []
+        for extent, wraps in zip(self.pixels.shape[:2], self.wraps, strict=True):
+            start = uniform_below(extent if wraps else extent - size + 1, generator)
+            ranges.append(np.arange(start, start + size) % extent)
+        crop = np.asarray(self.pixels[np.ix_(*ranges)], np.float32) / LEVELS
+        return torch.from_numpy(crop).permute(2, 0, 1).to(generator.device)
+
+
+def draw_patches(member: Member, size: int, count: int, settings: Settings, generator: torch.Generator) -> Tensor:
+    """Random crops of one exemplar, flipped and transposed by chance as those of a single one: [count, 3, size, size]."""
+    crops = [flip_by_chance(member.crop(size, generator), settings, generator) for _ in range(count)]
+    return torch.stack(crops).contiguous(memory_format=torch.channels_last)
+
+
+def read_members(folder: Path, smallest: int, skip: bool, on_warning: Callable[[str], None]) -> Iterator[Member]:
+    """The photographs of a folder, in the order of their names, one at a time.
+
+    Files that are unreadable or have fewer than `smallest` pixels along an axis are named to `on_warning` and left out if
+    `skip` says so. Raises ExemplarError for the first of them otherwise, and for a folder that is none.
+    """
+    if not folder.is_dir():
+        raise ExemplarError(f"{folder}: no such folder; expected a folder of photographs (PNG, JPEG, TIFF, EXR, ...)")
+    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES):
+        try:
+            photograph = read_photograph(path, smallest)
+        except ExemplarError as error:
+            if not skip:
+                raise ExemplarError(f"{error}; or leave such files out with --skip-unreadable") from error
+            on_warning(f"{error}; left out")
+            continue
+        if photograph.warning:
+            on_warning(f"{path}: {photograph.warning}")
+        pixels = np.round(photograph.pixels * LEVELS).astype(np.uint16)
+        yield Member(path.name, pixels, wraps(photograph.pixels), photograph.colorspace)
+
+
+def choose_held_out(names: Sequence[str], wanted: int | Sequence[str], seed: int) -> frozenset[str]:
+    """The names of the exemplars that are never trained on: so many, drawn at random, or those that `wanted` lists.
+
+    Raises ExemplarError if a name is not there, or if fewer than two are left to train on.
+    """
+    if isinstance(wanted, int):
+        order = np.random.Generator(np.random.Philox(seed)).permutation(len(names))
+        held_out = frozenset(names[place] for place in order[:wanted])
+    else:
+        held_out = frozenset(wanted)
+    if strange := sorted(held_out - set(names)):
+        raise ExemplarError(f"--hold-out: there is no readable photograph {strange[0]} in the folder")
+    if len(names) - len(held_out) < 2:
+        raise ExemplarError(f"{len(names)} photographs, {len(held_out)} of them held out; expected at least 2 to train on")
+    return held_out
+
+
+def wraps(exemplar: FloatArray) -> tuple[bool, bool]:
+    """Whether an image [H, W, 3] continues across its lower and its right edge: the step there is like any other."""
+    return (_continues(exemplar), _continues(exemplar.swapaxes(0, 1)))
+
+
+def _continues(rows: npt.NDArray[Any]) -> bool:
+    across = np.abs(rows[0] - rows[-1]).mean()
+    within = np.abs(np.diff(rows, axis=0)).mean()
+    return bool(across <= WRAPS * max(float(within), 1 / 255))

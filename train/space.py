@@ -1,0 +1,66 @@
+"""The texture space (Sec. 3.2): an encoder E, the mapping from z to octaves and style, and the sampler that they condition."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from solidgrain.train.encoder import Encoder
+from solidgrain.train.layers import Linear, activate
+from solidgrain.train.sampler import HIDDEN_LAYERS, Condition, Sampler
+from solidgrain.train.settings import Settings
+
+MAPPED = 128  # hidden units of Q and of f, and length of the style w
+START = 0.1  # of N(0,1), the weights of Q's and g's outputs: every texture starts close to the same one
+
+
+class Mapping(nn.Module):
+    """Q(z), f(z) and g_l(w): what tells one texture from another. Both outputs are relative to the sampler as it is.
+
+    Q's output comes on top of the sampler's own T_i, its bias in effect, so that octaves start orthogonal and within their
+    band as those of a single exemplar do; g_l's scale comes on top of one.
+    """
+
+    def __init__(self, settings: Settings, generator: torch.Generator) -> None:
+        super().__init__()
+        n, m = settings.octaves, settings.width
+        self.octaves = nn.ModuleList([Linear(settings.latent, MAPPED, generator), _small(MAPPED, 9 * n, generator)])  # Q
+        self.style = nn.ModuleList([Linear(settings.latent, MAPPED, generator), Linear(MAPPED, MAPPED, generator, gain=1.0)])
+        self.affine = nn.ModuleList(_small(MAPPED, 2 * m, generator) for _ in range(HIDDEN_LAYERS))  # g_l
+
+    def forward(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """z [B, latent] -> changes of the directions [B, n, 3, 3], gamma and delta [B, hidden layers, m]."""
+        directions = self.octaves[1](activate(self.octaves[0](z))).reshape(len(z), -1, 3, 3)
+        w = self.style[1](activate(self.style[0](z)))
+        scale, shift = torch.stack([affine(w) for affine in self.affine], 1).chunk(2, -1)
+        return directions, 1 + scale, shift
+
+
+class Space(nn.Module):
+    """E, Q, f, g_l and S: photographs in, colours of their solids out."""
+
+    def __init__(self, settings: Settings, generator: torch.Generator) -> None:
+        super().__init__()
+        self.sampler = Sampler(settings, generator)
+        self.encoder = Encoder(settings.latent, generator)
+        self.mapping = Mapping(settings, generator)
+
+    def condition(self, z: Tensor) -> Condition:
+        """The textures of latent codes z [B, latent]. In float32: octaves multiply whatever is lost here."""
+        with torch.autocast(z.device.type, enabled=False):
+            change, gamma, delta = self.mapping(z.float())
+            return Condition((self.sampler.directions + change) * self.sampler.octave_scale, gamma, delta)
+
+    def forward(self, tables: Tensor, points: Tensor, patches: Tensor) -> Tensor:
+        """Colour at points [B, P, 3] of the textures of patches [G, 3, 128, 128], each for B / G images in a row: [B, P, 3]."""
+        condition = self.condition(self.encoder(patches)).repeated(len(points) // len(patches))
+        rgb: Tensor = self.sampler(tables, points, condition)
+        return rgb
+
+
+def _small(inputs: int, outputs: int, generator: torch.Generator) -> Linear:
+    """An output layer that says little at first."""
+    layer = Linear(inputs, outputs, generator, gain=1.0)
+    with torch.no_grad():
+        layer.weight.mul_(START)
+    return layer

@@ -1,0 +1,102 @@
+"""The run directory of a texture space: that of `run`, with a folder of exemplars in the place of one.
+
+RUN/options.json          settings, provenance, every exemplar with its sha256 and whether it is held out
+RUN/exemplars/0000.npy    pixels, [H, W, 3] uint16, in the order of options.json
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from solidgrain.runtime.errors import TrainingError
+from solidgrain.runtime.files import replacing
+from solidgrain.train.collection import Member, choose_held_out
+from solidgrain.train.run import (
+    RunFolder,
+    Source,
+    common_options,
+    creating,
+    opening,
+    pixels_sha256,
+    source_revision,
+    write_options,
+)
+from solidgrain.train.settings import Budget, Settings
+
+EXEMPLARS = "exemplars"
+
+
+@dataclass(frozen=True)
+class SpaceRun(RunFolder):
+    """The training of a texture space."""
+
+    members: tuple[Member, ...]
+    held_out: frozenset[str]  # names of those that it is never trained on
+    license: str  # of all of them
+    credit: str
+
+    @property
+    def trained_on(self) -> list[Member]:
+        return [member for member in self.members if member.name not in self.held_out]
+
+    @property
+    def sources(self) -> list[Source]:
+        """Where the pixels that it is trained on came from."""
+        return [Source(member.name, self.license, self.credit, member.colorspace) for member in self.trained_on]
+
+
+def create_space_run(
+    folder: Path,
+    settings: Settings,
+    members: Iterable[Member],
+    held_out: int | Sequence[str],
+    source: Source,
+    budget: Budget,
+) -> SpaceRun:
+    """A new run directory; members are written as they come, and never held in memory together.
+
+    `source` gives the licence and the credit of them all. Raises TrainingError if the folder already holds a run or cannot be
+    written, ExemplarError if the members cannot be trained on.
+    """
+    with creating(folder):
+        (folder / EXEMPLARS).mkdir(exist_ok=True)
+        entries: list[dict[str, Any]] = []
+        for number, member in enumerate(members):
+            with replacing(_file(folder, number)) as file:
+                np.save(file, member.pixels)
+            facts = {"wraps": list(member.wraps), "colorspace": member.colorspace}
+            entries.append({"exemplar": member.name, "sha256": pixels_sha256(member.pixels), **facts})
+        names = choose_held_out([entry["exemplar"] for entry in entries], held_out, settings.seed)
+        for entry in entries:
+            entry["held_out"] = entry["exemplar"] in names
+        run = RunFolder(folder, settings, budget, source_revision())
+        write_options(run, {"exemplars": entries, "license": source.license, "credit": source.credit})
+    return open_space_run(folder)
+
+
+def open_space_run(folder: Path) -> SpaceRun:
+    """An existing run directory of a texture space. Raises TrainingError if it is not one, or was tampered with."""
+    with opening(folder) as options:
+        if "exemplars" not in options:
+            raise TrainingError(f"{folder}: the run of a single exemplar; expected one of a texture space")
+        entries, members = options["exemplars"], []
+        for number, entry in enumerate(entries):
+            pixels = np.load(_file(folder, number), mmap_mode="r", allow_pickle=False)
+            down, across = entry["wraps"]
+            members.append(Member(entry["exemplar"], pixels, (bool(down), bool(across)), entry["colorspace"]))
+        held_out = frozenset(entry["exemplar"] for entry in entries if entry["held_out"])
+        common = common_options(folder, options)
+        run = SpaceRun(*common, tuple(members), held_out, str(options["license"]), str(options["credit"]))
+    for number, (entry, member) in enumerate(zip(entries, members, strict=True)):
+        if pixels_sha256(member.pixels) != entry["sha256"]:
+            raise TrainingError(f"{_file(folder, number)}: not the pixels that the run was started with (sha256 differs)")
+    return run
+
+
+def _file(folder: Path, number: int) -> Path:
+    return folder / EXEMPLARS / f"{number:04d}.npy"

@@ -1,0 +1,120 @@
+"""What a training is about: the model, what a batch is drawn from, and what its progress is judged by.
+
+The loop is the same for a single exemplar (Sec. 3.1) and for a texture space (Sec. 3.2); this is where they differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from solidgrain.train import collection, exemplar
+from solidgrain.train.noise import draw_tables
+from solidgrain.train.run import Run, RunFolder
+from solidgrain.train.sampler import make_sampler
+from solidgrain.train.settings import Settings
+from solidgrain.train.slices import draw_slices
+from solidgrain.train.space import Space
+from solidgrain.train.space_run import SpaceRun
+
+PLACES = 4096  # at which an average is looked at
+SHOWN = 4  # exemplars of a space in a sample, half of them held out
+
+
+class Batch(NamedTuple):
+    """What the model is called with, and what its slices are compared with."""
+
+    inputs: tuple[Tensor, ...]  # noise tables, points [B, patch², 3], and for a space the patches that E sees
+    real: Tensor  # [B, 3, patch, patch]
+
+
+class Probe(NamedTuple):
+    """A fixed question to a model, and the exemplars [3, H, W] whose colours its answers [K, P, 3] should have."""
+
+    inputs: tuple[Tensor, ...]
+    exemplars: Sequence[Tensor]
+
+
+class Task(Protocol):
+    def make_model(self, generator: torch.Generator) -> nn.Module: ...
+
+    def draw(self, generator: torch.Generator) -> Batch: ...
+
+    def probe(self) -> Probe: ...
+
+    def shown(self) -> Sequence[tuple[Tensor, tuple[Tensor, ...]]]:
+        """What a sample shows: exemplars [3, H, W], with what the model needs besides tables and points for each."""
+
+
+def make_task(run: RunFolder, device: torch.device) -> Task:
+    if isinstance(run, SpaceRun):
+        return TextureSpace(run, device)
+    assert isinstance(run, Run)
+    return SingleExemplar(run, device)
+
+
+class SingleExemplar:
+    """Sec. 3.1."""
+
+    def __init__(self, run: Run, device: torch.device) -> None:
+        self.settings, self.device = run.settings, device
+        self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
+
+    def make_model(self, generator: torch.Generator) -> nn.Module:
+        return make_sampler(self.settings, generator)
+
+    def draw(self, generator: torch.Generator) -> Batch:
+        inputs = draw_noise(self.settings, generator), draw_slices(self.settings, generator)
+        return Batch(inputs, exemplar.draw_patches(self.exemplar, self.settings, generator))
+
+    def probe(self) -> Probe:
+        return Probe(_probe_inputs(self.settings, 1, self.device), [self.exemplar])
+
+    def shown(self) -> Sequence[tuple[Tensor, tuple[Tensor, ...]]]:
+        return [(self.exemplar, ())]
+
+
+class TextureSpace:
+    """Sec. 3.2: a batch is a few exemplars, E sees one patch of each, and D sees other patches of the same."""
+
+    def __init__(self, run: SpaceRun, device: torch.device) -> None:
+        self.settings, self.device, self.run = run.settings, device, run
+        self.members = run.trained_on
+
+    def make_model(self, generator: torch.Generator) -> nn.Module:
+        return Space(self.settings, generator)
+
+    def draw(self, generator: torch.Generator) -> Batch:
+        settings, device = self.settings, self.device
+        tables, points = draw_noise(settings, generator), draw_slices(settings, generator)
+        order = torch.randperm(len(self.members), generator=generator, device=device).tolist()
+        chosen = [self.members[order[k % len(order)]] for k in range(settings.batch // settings.group)]
+        seen = [collection.draw_patches(one, settings.encoded_patch, 1, settings, generator) for one in chosen]
+        real = [collection.draw_patches(one, settings.patch, settings.group, settings, generator) for one in chosen]
+        return Batch((tables, points, torch.cat(seen)), torch.cat(real).contiguous(memory_format=torch.channels_last))
+
+    def probe(self) -> Probe:
+        generator = torch.Generator(self.device).manual_seed(7)
+        seen = [member.crop(self.settings.encoded_patch, generator) for member in self.members[:SHOWN]]
+        return Probe((*_probe_inputs(self.settings, len(seen), self.device), torch.stack(seen)), seen)
+
+    def shown(self) -> Sequence[tuple[Tensor, tuple[Tensor, ...]]]:
+        generator = torch.Generator(self.device).manual_seed(7)
+        unseen = [member for member in self.run.members if member.name in self.run.held_out][: SHOWN // 2]
+        patches = [one.crop(self.settings.encoded_patch, generator) for one in (*self.members[: SHOWN - len(unseen)], *unseen)]
+        return [(patch, (patch[None],)) for patch in patches]
+
+
+def draw_noise(settings: Settings, generator: torch.Generator) -> Tensor:
+    """One fresh noise instance, shared by the batch."""
+    return draw_tables(settings.octaves, settings.resolution, generator)
+
+
+def _probe_inputs(settings: Settings, images: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """One instance at far-apart places, which are as independent as instances."""
+    generator = torch.Generator(device).manual_seed(7)
+    tables = draw_noise(settings, generator)
+    return tables, 64 * torch.rand(images, PLACES, 3, generator=generator, device=device)
