@@ -128,9 +128,9 @@ def bake_shard(values: dict[str, Any], number: int, count: int, provider: str, t
 @cache
 def _texture(source: str, bundle: str | None, precision: str, provider: str, threads: int) -> Texture:
     """Loaded once per worker process."""
-    from solidgrain.runtime import load
+    from solidgrain.runtime import load_texture
 
-    return load(source, bundle=bundle, precision=precision, provider=provider, threads=threads)
+    return load_texture(source, bundle=bundle, precision=precision, provider=provider, threads=threads)
 
 
 def _workers(cluster: str) -> int:

@@ -14,7 +14,7 @@ from solidgrain.bake.manifest import SUFFIX, damaged_files, manifest_path, read_
 from solidgrain.bake.plan import Plan, hash_of
 from solidgrain.bake.schema import plan_of
 from solidgrain.bake.writers import FloatArray, Output, clips, open_writer
-from solidgrain.runtime import Texture, load
+from solidgrain.runtime import Texture, load_texture
 from solidgrain.runtime.errors import BakeError
 
 MACHINES = 1e-3  # by how much two machines' paths of the sampler may differ, in any colour space
@@ -45,7 +45,7 @@ def verify(
     compared, largest = 0, 0.0
     if voxels and not wrong:
         plan, output = _planned(manifest, path)
-        texture = load(
+        texture = load_texture(
             source or plan.source,
             bundle=bundle or plan.bundle,
             provider=provider,

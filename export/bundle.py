@@ -17,7 +17,20 @@ import onnx
 import onnxruntime
 
 from solidgrain.export.sampler_graph import OPSET, build_sampler_graph
-from solidgrain.runtime.bundle import CARD, FORMAT, FORMAT_VERSION, MANIFEST, SAMPLER, TEXTURE, file_sha256
+from solidgrain.export.space_graphs import EncoderWeights, MappingWeights, build_encoder_graph, build_mapping_graph
+from solidgrain.runtime.bundle import (
+    CARD,
+    CRITIC,
+    ENCODER,
+    FORMAT,
+    FORMAT_VERSION,
+    MANIFEST,
+    MAPPING,
+    SAMPLER,
+    TEXTURE,
+    file_sha256,
+    probe_patch,
+)
 from solidgrain.runtime.errors import BundleError
 from solidgrain.runtime.files import sync
 from solidgrain.runtime.lattice import untiled
@@ -28,6 +41,7 @@ FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
 
 PROBE_SEED = 7
+PLACES = ((0.5, 0.5, 0.5), (-12.25, 100.0, 3.75), (1e6 + 0.5, -1e6, 64.0), (1e9 + 0.5, 0.5, -1e9 + 0.5))
 
 
 @dataclass(frozen=True)
@@ -46,6 +60,16 @@ class SamplerWeights:
 
 
 @dataclass(frozen=True)
+class SpaceWeights:
+    """A texture space as plain arrays: what `SamplerWeights` is to one texture."""
+
+    weights: Sequence[FloatArray]
+    biases: Sequence[FloatArray]
+    encoder: EncoderWeights
+    mapping: MappingWeights
+
+
+@dataclass(frozen=True)
 class Details:
     """What the manifest and the model card say besides the numbers."""
 
@@ -56,21 +80,22 @@ class Details:
     card: str = ""
 
 
-def write_bundle(folder: Path, sampler: SamplerWeights, details: Details, overwrite: bool = False) -> Path:
+def write_bundle(folder: Path, content: SamplerWeights | SpaceWeights, details: Details, overwrite: bool = False) -> Path:
     """Write a bundle folder, whole or not at all.
 
     Raises BundleError if the folder exists (and `overwrite` is not set, or it is not a bundle) or cannot be written.
     """
     if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
         raise BundleError(f"{folder}: already exists; choose another --out, or --overwrite to replace a bundle")
-    if folder.exists() and (strange := {path.name for path in folder.iterdir()} - {MANIFEST, SAMPLER, TEXTURE, CARD}):
+    parts = {MANIFEST, SAMPLER, TEXTURE, CARD, ENCODER, MAPPING, CRITIC}
+    if folder.exists() and (strange := {path.name for path in folder.iterdir()} - parts):
         raise BundleError(f"{folder}: holds {', '.join(sorted(strange))}, which is no part of a bundle; move it away first")
     folder = folder.resolve()
     building = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     former = folder.with_name(f".{folder.name}.{os.getpid()}.old")
     try:
         building.mkdir(parents=True)
-        _fill(building, sampler, details)
+        _fill(building, content, details)
         for path in building.iterdir():
             sync(path)
         if folder.exists():
@@ -84,19 +109,15 @@ def write_bundle(folder: Path, sampler: SamplerWeights, details: Details, overwr
     return folder
 
 
-def _fill(folder: Path, sampler: SamplerWeights, details: Details) -> None:
-    octaves, layers, width = len(sampler.transforms), *sampler.gamma.shape
-    model = build_sampler_graph(sampler.weights, sampler.biases, octaves)
+def _fill(folder: Path, content: SamplerWeights | SpaceWeights, details: Details) -> None:
+    """Graphs and texture, then the manifest that vouches for them."""
+    octaves, layers, width = _sizes(content)
+    model = build_sampler_graph(content.weights, content.biases, octaves)
     onnx.save(model, folder / SAMPLER)
-    texture = TextureData(
-        name=details.name,
-        sampler_sha256=file_sha256(folder / SAMPLER),
-        transforms=sampler.transforms,
-        gamma=sampler.gamma,
-        delta=sampler.delta,
-        noise_weights=sampler.noise_weights,
-    )
-    write_texture(folder / TEXTURE, texture)
+    if isinstance(content, SamplerWeights):
+        facts = _texture(folder, model, content, details)
+    else:
+        facts = _space(folder, model, content, details)
     manifest = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -108,8 +129,8 @@ def _fill(folder: Path, sampler: SamplerWeights, details: Details) -> None:
         "hidden_layers": layers,
         "patch": details.patch,
         "color_encoding": details.color_encoding,
-        "files": {name: file_sha256(folder / name) for name in (SAMPLER, TEXTURE)},
-        "probe": _probe(model, texture),
+        "files": {path.name: file_sha256(path) for path in sorted(folder.iterdir())},
+        **facts,
         "training": details.training,
     }
     (folder / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", "utf-8")
@@ -117,16 +138,64 @@ def _fill(folder: Path, sampler: SamplerWeights, details: Details) -> None:
         (folder / CARD).write_text(details.card, "utf-8")
 
 
-def _probe(model: onnx.ModelProto, texture: TextureData) -> dict[str, Any]:
-    """A few points and their colours: what an installation elsewhere must reproduce (`solidgrain info` compares)."""
-    points = np.array([[0.5, 0.5, 0.5], [-12.25, 100.0, 3.75], [1e6 + 0.5, -1e6, 64.0], [1e9 + 0.5, 0.5, -1e9 + 0.5]])
-    rgb = run_graph(model, texture, points, PROBE_SEED)
-    return {"seed": PROBE_SEED, "points": points.tolist(), "rgb": rgb.astype(float).tolist()}
+def _sizes(content: SamplerWeights | SpaceWeights) -> tuple[int, int, int]:
+    """Octaves, hidden layers, width."""
+    noise_weights = content.noise_weights if isinstance(content, SamplerWeights) else content.mapping.noise_weights
+    return 4 * noise_weights.shape[1], len(content.biases) - 1, noise_weights.shape[2]
+
+
+def _texture(folder: Path, model: onnx.ModelProto, content: SamplerWeights, details: Details) -> dict[str, Any]:
+    """The texture of a single exemplar, and a probe of it: what an installation elsewhere must reproduce."""
+    texture = TextureData(
+        name=details.name,
+        sampler_sha256=file_sha256(folder / SAMPLER),
+        transforms=content.transforms,
+        gamma=content.gamma,
+        delta=content.delta,
+        noise_weights=content.noise_weights,
+    )
+    write_texture(folder / TEXTURE, texture)
+    return {"probe": _probe(model, texture, PLACES)}
+
+
+def _space(folder: Path, model: onnx.ModelProto, content: SpaceWeights, details: Details) -> dict[str, Any]:
+    """Encoder and mapping, and a probe of all three graphs: the code of a fixed patch, and colours of its texture."""
+    encoder, mapping = build_encoder_graph(content.encoder), build_mapping_graph(content.mapping)
+    onnx.save(encoder, folder / ENCODER)
+    onnx.save(mapping, folder / MAPPING)
+    z = run_encoder(encoder, probe_patch(content.encoder.patch)[None])
+    texture = run_mapping(mapping, z, details.name, file_sha256(folder / SAMPLER))[0]
+    probe = {"z": z[0].astype(float).tolist(), **_probe(model, texture, PLACES[:2])}
+    return {"latent": z.shape[1], "encoded_patch": content.encoder.patch, "probe": probe}
+
+
+def _probe(model: onnx.ModelProto, texture: TextureData, places: Sequence[Sequence[float]]) -> dict[str, Any]:
+    """A few points and their colours (`solidgrain info` compares).
+
+    A mapping's transforms may differ by a last bit between processors, which shows far from the origin: a space's are near it.
+    """
+    rgb = run_graph(model, texture, np.array(places), PROBE_SEED)
+    return {"seed": PROBE_SEED, "points": [list(place) for place in places], "rgb": rgb.astype(float).tolist()}
+
+
+def run_encoder(model: onnx.ModelProto, patches: FloatArray) -> FloatArray:
+    """z [B, latent] of patches [B, patch, patch, 3]."""
+    feed = {"exemplar": np.ascontiguousarray(patches.transpose(0, 3, 1, 2))}
+    z: FloatArray = _session(model).run(["z"], feed)[0]
+    return z
+
+
+def run_mapping(model: onnx.ModelProto, z: FloatArray, name: str, sampler_sha256: str) -> list[TextureData]:
+    """The textures of latent codes [B, latent]."""
+    parts = _session(model).run(["transforms", "gamma", "delta", "noise_weights"], {"z": z})
+    return [
+        TextureData(name, sampler_sha256, transforms.astype(np.float64), gamma, delta, noise_weights, code)
+        for transforms, gamma, delta, noise_weights, code in zip(*parts, z, strict=True)
+    ]
 
 
 def run_graph(model: onnx.ModelProto, texture: TextureData, points: DoubleArray, seed: int) -> FloatArray:
     """What a sampler graph says at points [P, 3] in exemplar pixels -> [P, 3], not clipped."""
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     octaves = len(texture.transforms)
     feed = {
         **texture.arrays(),
@@ -135,5 +204,9 @@ def run_graph(model: onnx.ModelProto, texture: TextureData, points: DoubleArray,
         "lattice": untiled(texture.transforms).lattice,
         "noise": noise_tables(seed, octaves),
     }
-    rgb: FloatArray = session.run(["rgb"], feed)[0]
+    rgb: FloatArray = _session(model).run(["rgb"], feed)[0]
     return rgb
+
+
+def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+    return onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 QUALITY = "## Quality"
+MANY = 8  # exemplars that get a line each
 
 
 def write_card(name: str, training: dict[str, Any]) -> str:
@@ -19,13 +20,35 @@ def write_card(name: str, training: dict[str, Any]) -> str:
         ("minutes", f"{training['minutes']:g}"),
         ("trained by", f"solidgrain {training['revision']}"),
     ]
-    exemplars = [
-        f"- `{entry['exemplar']}`, licence: {entry['license'] or 'not stated'}, credit: {entry['credit'] or 'not stated'}\n"
-        f"  (read as {entry.get('colorspace') or 'not stated'}, sha256 of its pixels `{entry['sha256'][:16]}…`)"
-        for entry in training["exemplars"]
-    ]
-    lines = [f"# {name}", "", "A solid texture trained on:", "", *exemplars, "", "| | |", "|---|---|"]
+    exemplars = (
+        _grouped(training["exemplars"])
+        if len(training["exemplars"]) > MANY
+        else [
+            f"- `{entry['exemplar']}`, licence: {entry['license'] or 'not stated'}, credit: {entry['credit'] or 'not stated'}\n"
+            f"  (read as {entry.get('colorspace') or 'not stated'}, sha256 of its pixels `{entry['sha256'][:16]}…`)"
+            for entry in training["exemplars"]
+        ]
+    )
+    if held_out := training.get("held_out"):
+        exemplars.append(f"- never trained on, for its evaluation: {_names(held_out)}")
+    kind = "A space of solid textures" if settings.get("latent") else "A solid texture"
+    lines = [f"# {name}", "", f"{kind}, trained on:", "", *exemplars, "", "| | |", "|---|---|"]
     return "\n".join([*lines, *(f"| {label} | {value} |" for label, value in rows), ""])
+
+
+def _grouped(exemplars: list[dict[str, Any]]) -> list[str]:
+    """Many exemplars, a line for each licence and credit; the manifest has every sha256."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for entry in exemplars:
+        groups.setdefault((entry["license"], entry["credit"]), []).append(entry["exemplar"])
+    return [
+        f"- licence: {license or 'not stated'}, credit: {credit or 'not stated'}: {_names(names)}"
+        for (license, credit), names in groups.items()
+    ]
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
 
 
 def with_quality(card: str, table: str) -> str:

@@ -18,14 +18,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.export.from_run import export_run
+    from solidgrain.export.from_space_run import export_space_run
     from solidgrain.runtime.bundle import open_bundle
+    from solidgrain.train.run import is_space
 
-    folder = export_run(arguments.run, arguments.out, arguments.name, arguments.overwrite)
+    space = is_space(arguments.run)
+    export = export_space_run if space else export_run
+    folder = export(arguments.run, arguments.out, arguments.name, arguments.overwrite)
     if arguments.json:
         print(json.dumps(open_bundle(folder).manifest, indent=2))
     else:
         size = sum(path.stat().st_size for path in folder.iterdir())
-        print(
-            f"{folder}: {size / 1024:.0f} KB; bake it with solidgrain bake {folder} --size 128 --out out.vti", file=sys.stderr
-        )
+        source = f"PHOTO --bundle {folder}" if space else folder
+        print(f"{folder}: {size / 1024:.0f} KB; next: solidgrain bake {source} --size 128 --out out.vti", file=sys.stderr)
     return 0

@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     from solidgrain.export.card import with_quality
     from solidgrain.export.figures import make_figures
     from solidgrain.export.sheet import make_sheet, write_sheet
-    from solidgrain.runtime import load
+    from solidgrain.runtime import load_texture
     from solidgrain.runtime.bundle import CARD
     from solidgrain.runtime.files import replacing
     from solidgrain.train.copying import measure_copying
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.sheet:
         check_sheet(arguments.sheet, arguments.exemplar)
     inception = Inception(arguments.inception) if arguments.inception else None
-    texture = load(arguments.source, threads=arguments.threads)
+    texture = load_texture(arguments.source, threads=arguments.threads)
     manifest = texture.bundle.manifest
     exemplar = read_exemplar(arguments.exemplar, SMALLEST)
     grain = manifest["training"].get("settings", {}).get("grain", "none")

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from solidgrain.export.bundle import Details, DoubleArray, SamplerWeights, run_graph, write_bundle
+from solidgrain.export.bundle import Details, DoubleArray, FloatArray, SamplerWeights, run_graph, write_bundle
 from solidgrain.export.card import write_card
 from solidgrain.export.sampler_graph import build_sampler_graph
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.texture_file import TextureData
-from solidgrain.train.run import Run, open_run
+from solidgrain.train.run import Run, RunFolder, open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import to_json
 from solidgrain.train.slices import UNIT
@@ -35,9 +35,7 @@ def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = Fa
             f"{run_folder}: a run with --variant {run.settings.variant} feeds noise at the input, which a bundle cannot hold; "
             "look at its samples, or train with --variant paper"
         )
-    state = run.load_checkpoint()
-    if state is None:
-        raise TrainingError(f"{run_folder}: no checkpoint yet; let solidgrain train --resume {run_folder} go on for a while")
+    state = trained_state(run)
     average = Sampler(run.settings, torch.Generator())
     try:
         average.load_state_dict(state["average"])
@@ -52,22 +50,37 @@ def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = Fa
     return write_bundle(out, weights, details, overwrite)
 
 
+def trained_state(run: RunFolder) -> dict[str, Any]:
+    """A run's last checkpoint. Raises TrainingError if there is none."""
+    state = run.load_checkpoint()
+    if state is None:
+        raise TrainingError(f"{run.folder}: no checkpoint yet; let solidgrain train --resume {run.folder} go on for a while")
+    return state
+
+
 @torch.no_grad()
 def sampler_weights(sampler: Sampler) -> SamplerWeights:
     """A torch sampler as plain arrays. A single exemplar has no style: gamma is one and delta zero (Eq. 5)."""
-    layers = [*sampler.hidden, sampler.output]
-    weights = [layer.effective_weight().T.numpy() for layer in layers]  # x W
-    biases = [layer.bias.numpy() for layer in layers]
-    biases[0] = sampler.constant.numpy() @ weights[0] + biases[0]
+    weights, biases = sampler_layers(sampler)
     shape = (len(sampler.hidden), len(sampler.constant))
     return SamplerWeights(
-        weights=weights[1:],
+        weights=weights,
         biases=biases,
         transforms=copy.deepcopy(sampler).double().transforms().numpy() / UNIT,
         noise_weights=sampler.noise_weights.numpy(),
         gamma=np.ones(shape, np.float32),
         delta=np.zeros(shape, np.float32),
     )
+
+
+@torch.no_grad()
+def sampler_layers(sampler: Sampler) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Weights (x W) of all layers but the first, and biases of all: the first sees a constant, its product is a bias."""
+    layers = [*sampler.hidden, sampler.output]
+    weights = [layer.effective_weight().T.numpy() for layer in layers]
+    biases = [layer.bias.numpy() for layer in layers]
+    biases[0] = sampler.constant.numpy() @ weights[0] + biases[0]
+    return weights[1:], biases
 
 
 @torch.no_grad()
@@ -80,7 +93,7 @@ def check_agreement(sampler: Sampler, weights: SamplerWeights, seed: int = 1) ->
     texture = TextureData("", "", weights.transforms, weights.gamma, weights.delta, weights.noise_weights)
     model = build_sampler_graph(weights.weights, weights.biases, octaves)
     exact, tables = copy.deepcopy(sampler).double(), torch.from_numpy(noise_tables(seed, octaves)).double()
-    points = _random_points(seed)
+    points = random_points(seed)
     exact.offsets = torch.from_numpy(noise_offsets(seed, octaves))
     expected = exact(tables, torch.from_numpy(points / UNIT)[None])[0].numpy()
     worst = float(np.abs(run_graph(model, texture, points, seed) - expected).max())
@@ -89,7 +102,7 @@ def check_agreement(sampler: Sampler, weights: SamplerWeights, seed: int = 1) ->
     return worst
 
 
-def _random_points(seed: int) -> DoubleArray:
+def random_points(seed: int) -> DoubleArray:
     """Points within 64, 10^4 and 10^9 pixels of the origin, 2048 of each."""
     draw = np.random.default_rng(seed).uniform(-1, 1, (3, 2048, 3))
     points: DoubleArray = (draw * np.array([64.0, 1e4, 1e9])[:, None, None]).reshape(-1, 3)

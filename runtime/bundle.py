@@ -3,6 +3,9 @@
     manifest.json      format and version, octaves and widths, sha256 of every file, a probe, training provenance
     sampler.onnx       points -> colour; everything that a texture owns is an input
     texture.sgt.npz    the texture of a single-exemplar bundle
+    encoder.onnx       photograph -> latent code, of a texture space
+    mapping.onnx       latent code -> texture, of a texture space
+    critic.npz         what adapting a texture to a photograph needs besides (optional, in training's own format)
     card.md            the model card (optional)
 
 Everything is checked on load, and an error says which file is wrong, what was expected and what was found.
@@ -18,9 +21,13 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from solidgrain.runtime.errors import BundleError
 
 MANIFEST, SAMPLER, TEXTURE, CARD = "manifest.json", "sampler.onnx", "texture.sgt.npz", "card.md"
+ENCODER, MAPPING, CRITIC = "encoder.onnx", "mapping.onnx", "critic.npz"
 FORMAT, FORMAT_VERSION = "solidgrain-bundle", 1
 KEYS: dict[str, type] = {
     "name": str,
@@ -47,6 +54,11 @@ class Bundle:
     @property
     def name(self) -> str:
         return str(self.manifest["name"])
+
+    @property
+    def is_space(self) -> bool:
+        """Whether it turns photographs into textures, and holds none of its own."""
+        return ENCODER in self.manifest["files"]
 
     @property
     def sampler_sha256(self) -> str:
@@ -89,6 +101,9 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         wrong = ["files"]
     if not wrong and not {"seed", "points", "rgb"} <= manifest["probe"].keys():
         wrong = ["probe"]
+    if not wrong and ENCODER in manifest["files"]:
+        wrong = [key for key in ("latent", "encoded_patch") if not isinstance(manifest.get(key), int)]
+        wrong += [] if "z" in manifest["probe"] and MAPPING in manifest["files"] else ["probe"]
     if wrong or SAMPLER not in manifest["files"]:
         raise BundleError(f"{path}: incomplete manifest (check {', '.join(wrong) or SAMPLER}); export the bundle again")
     return dict(manifest)
@@ -102,6 +117,14 @@ def file_sha256(path: Path) -> str:
 def embedded_names() -> list[str]:
     """The names of the textures that come with the package."""
     return sorted(folder.name for folder in _embedded_root().iterdir() if (folder / MANIFEST).is_file())
+
+
+def bundle_folder(source: str) -> Path:
+    """The folder of a bundle that is named by its path, or of an embedded one. Raises BundleError if there is none."""
+    path = Path(source)
+    if path.is_dir() and ((path / MANIFEST).is_file() or source not in embedded_names()):
+        return path
+    return embedded_folder(source)
 
 
 def embedded_folder(name: str) -> Path:
@@ -121,6 +144,12 @@ def find_bundle(sampler_sha256: str, near: Path) -> Path | None:
         if (folder / MANIFEST).is_file() and path.is_file() and file_sha256(path) == sampler_sha256:
             return folder
     return None
+
+
+def probe_patch(size: int) -> npt.NDArray[np.float32]:
+    """A fixed picture [size, size, 3] in [0, 1] that a space's probe encodes."""
+    rows, columns, channels = np.meshgrid(np.arange(size), np.arange(size), np.arange(3), indexing="ij")
+    return np.asarray((7 * rows + 3 * columns * (channels + 1) + rows * columns // 16) % 64 / 63, np.float32)
 
 
 def _embedded_root() -> Path:

@@ -1,4 +1,4 @@
-"""Textures: what pipeline scripts hold in their hands. `load` one, then `sample`, `grid` or `slabs`."""
+"""Textures: what pipeline scripts hold in their hands. Load one, then `sample`, `grid` or `slabs`."""
 
 from __future__ import annotations
 
@@ -11,15 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.runtime.bundle import (
-    MANIFEST,
-    TEXTURE,
-    Bundle,
-    embedded_folder,
-    embedded_names,
-    find_bundle,
-    open_bundle,
-)
+from solidgrain.runtime.bundle import TEXTURE, Bundle, bundle_folder, find_bundle, open_bundle
 from solidgrain.runtime.engine import Engine, Instance, open_engine
 from solidgrain.runtime.errors import BundleError, EvaluationError
 from solidgrain.runtime.lattice import Tiling, tiled, untiled
@@ -38,7 +30,7 @@ FARTHEST = 2.0**36  # exemplar pixels: float64 coordinates still tell the places
 LARGEST = 2**40  # voxels along an axis, threads, slices: what no machine has
 
 
-def load(
+def load_texture(
     source: str | os.PathLike[str] = DEFAULT_TEXTURE,
     *,
     bundle: str | os.PathLike[str] | None = None,
@@ -52,21 +44,27 @@ def load(
     the fused kernel, or ONNX Runtime on the CPU where there is no kernel for this machine or bundle (`Texture.provider` and
     `provider_note` say which and why); "kernel" insists; "cpu", "cuda", "directml", "coreml", "openvino" are ONNX Runtime's
     execution providers. One that cannot be had is an error. `precision` "bfloat16" is faster where the processor has AMX,
-    and an error elsewhere. `threads` of 0 uses every processor that this process may use. Raises BundleError or ProviderError.
+    and an error elsewhere. `threads` of 0 uses every processor that this process may use. Raises BundleError or
+    ProviderError; for a space, which is no texture, BundleError.
     """
     data, owner = _resolve(os.fspath(source), None if bundle is None else Path(bundle))
-    (count,) = _whole("threads", (threads,), count=1, least=0)
+    return open_texture(data, owner, provider, precision, make_workers(threads))
+
+
+def open_texture(data: TextureData, owner: Bundle, provider: str, precision: str, workers: Workers) -> Texture:
+    """A texture on what evaluates it. Raises BundleError or ProviderError."""
+    check_fits(data, owner)
     engine, note = open_engine(owner, data, provider.lower(), precision)
-    return Texture(data, owner, engine, Workers(count or usable_threads()), note)
+    return Texture(data, owner, engine, workers, note)
+
+
+def make_workers(threads: int) -> Workers:
+    (count,) = _whole("threads", (threads,), count=1, least=0)
+    return Workers(count or usable_threads())
 
 
 def _resolve(source: str, bundle: Path | None) -> tuple[TextureData, Bundle]:
     path = Path(source)
-    if path.is_dir() and ((path / MANIFEST).is_file() or source not in embedded_names()):
-        owner = open_bundle(path)
-        if not (path / TEXTURE).is_file():
-            raise BundleError(f"{path / TEXTURE}: missing; this bundle holds no texture of its own")
-        return _matching(read_texture(path / TEXTURE), owner)
     if path.is_file():
         data = read_texture(path)
         folder = bundle or find_bundle(data.sampler_sha256, path.parent)
@@ -75,13 +73,20 @@ def _resolve(source: str, bundle: Path | None) -> tuple[TextureData, Bundle]:
             raise BundleError(
                 f"{path}: needs the bundle whose sampler.onnx has sha256 {wanted}; name it with bundle= or --bundle"
             )
-        return _matching(data, open_bundle(folder))
-    owner = open_bundle(embedded_folder(source))
-    return _matching(read_texture(owner.folder / TEXTURE), owner)
+        return data, open_bundle(folder)
+    owner = open_bundle(bundle_folder(source))
+    if owner.is_space:
+        raise BundleError(
+            f"{source}: is a space, which holds no texture of its own; "
+            f"solidgrain encode PHOTO --bundle {source} --out PHOTO.sgt.npz makes one"
+        )
+    if not (owner.folder / TEXTURE).is_file():
+        raise BundleError(f"{owner.folder / TEXTURE}: missing; this bundle holds no texture of its own")
+    return read_texture(owner.folder / TEXTURE), owner
 
 
-def _matching(data: TextureData, owner: Bundle) -> tuple[TextureData, Bundle]:
-    """The texture and its bundle, if they belong together."""
+def check_fits(data: TextureData, owner: Bundle) -> None:
+    """Raises BundleError if a texture and a bundle do not belong together."""
     if data.sampler_sha256 != owner.sampler_sha256:
         raise BundleError(
             f"{owner.folder}: its sampler.onnx has sha256 {owner.sampler_sha256[:12]}…, "
@@ -96,11 +101,10 @@ def _matching(data: TextureData, owner: Bundle) -> tuple[TextureData, Bundle]:
                 f"{owner.folder}: {name} of texture {data.name!r} has shape {data.arrays()[name].shape}, expected {shape}; "
                 "the texture is damaged, save it again"
             )
-    return data, owner
 
 
 class Texture:
-    """A solid texture: colour at every point of space, in endless instances, one per seed. Made by `load`."""
+    """A solid texture: colour at every point of space, in endless instances, one per seed."""
 
     def __init__(self, data: TextureData, bundle: Bundle, engine: Engine, workers: Workers, provider_note: str = "") -> None:
         self.data, self.bundle, self.workers, self.provider_note = data, bundle, workers, provider_note

@@ -1,8 +1,9 @@
 """Texture files, `*.sgt.npz`: everything that the sampler needs besides its shared weights, about 25 KB.
 
 A NumPy archive: `transforms` [n, 3, 3] float64 in texels per exemplar pixel, `gamma` and
-`delta` [hidden layers, width], `noise_weights` [4, n/4, width] float32, and `header`, a JSON object with the format version,
-a name, and the sha256 of the sampler that the numbers belong to. Equal textures give equal bytes.
+`delta` [hidden layers, width], `noise_weights` [4, n/4, width] float32, for textures of a space `latent` [latent] float32, and
+`header`, a JSON object with the format version, a name, and the sha256 of the sampler that the numbers belong to. Equal
+textures give equal bytes.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,8 +36,10 @@ class TextureData:
     gamma: npt.NDArray[np.float32]  # [hidden layers, m]
     delta: npt.NDArray[np.float32]  # [hidden layers, m]
     noise_weights: npt.NDArray[np.float32]  # [4, n/4, m]
+    latent: npt.NDArray[np.float32] | None = None  # z, where in its space it lies; no part of its colours
 
-    def arrays(self) -> dict[str, npt.NDArray[np.generic]]:
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """What its colours depend on."""
         return {name: getattr(self, name) for name in ARRAYS}
 
     @property
@@ -48,6 +52,7 @@ class TextureData:
 
 
 ARRAYS = {"transforms": np.float64, "gamma": np.float32, "delta": np.float32, "noise_weights": np.float32}
+OPTIONAL = {"latent": np.float32}
 
 
 def write_texture(path: Path, texture: TextureData) -> None:
@@ -58,9 +63,12 @@ def write_texture(path: Path, texture: TextureData) -> None:
         "name": texture.name,
         "sampler_sha256": texture.sampler_sha256,
     }
+    arrays = {"header": np.array(json.dumps(header)), **texture.arrays()}
+    if texture.latent is not None:
+        arrays["latent"] = texture.latent
     try:
         with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, array in {"header": np.array(json.dumps(header)), **texture.arrays()}.items():
+            for name, array in arrays.items():
                 data = io.BytesIO()
                 np.lib.format.write_array(data, np.asarray(array, order="C"), allow_pickle=False)
                 archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getvalue(), zipfile.ZIP_DEFLATED)
@@ -73,7 +81,7 @@ def read_texture(path: Path) -> TextureData:
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             header = dict(json.loads(str(archive["header"])))
-            arrays = {name: archive[name] for name in ARRAYS}
+            arrays = {name: archive[name] for name in (*ARRAYS, *(set(OPTIONAL) & set(archive.files)))}
             name, sampler_sha256 = str(header.get("name", "")), str(header.get("sampler_sha256", ""))
     except OSError as error:
         raise BundleError(f"{path}: cannot read the texture file ({error})") from error
@@ -82,7 +90,9 @@ def read_texture(path: Path) -> TextureData:
     if header.get("format") != FORMAT or header.get("format_version") != FORMAT_VERSION:
         found = f"{header.get('format')} version {header.get('format_version')}"
         raise BundleError(f"{path}: {found}, expected {FORMAT} version {FORMAT_VERSION}; save it again or update solidgrain")
-    for key, dtype in ARRAYS.items():
+    for key, dtype in (ARRAYS | OPTIONAL).items():
+        if key not in arrays:
+            continue
         if arrays[key].dtype != dtype or not np.isfinite(arrays[key]).all():
             raise BundleError(f"{path}: {key} is not finite {np.dtype(dtype)}; the file is damaged, save it again")
     return TextureData(name, sampler_sha256, **arrays)

@@ -91,9 +91,9 @@ def emit_job(plan: Plan, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def load_texture(arguments: argparse.Namespace) -> Texture:
-    from solidgrain.runtime import load
+    from solidgrain.runtime import load_texture
 
-    return load(
+    return load_texture(
         arguments.source or "granite",
         bundle=arguments.bundle,
         provider=arguments.provider,

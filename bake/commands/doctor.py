@@ -63,24 +63,24 @@ def _onnxruntime_builds(problems: list[str]) -> list[str]:
 
 def _kernel() -> dict[str, Any]:
     """The fused kernel: the paths that run here and the one that is used, or why there is none. It may be missing."""
-    from solidgrain.runtime import ProviderError, load
+    from solidgrain.runtime import ProviderError, load_texture
     from solidgrain.runtime.kernel import kernel_paths
 
     try:
-        return {"paths": list(kernel_paths()), "used": load(provider="kernel").provider}
+        return {"paths": list(kernel_paths()), "used": load_texture(provider="kernel").provider}
     except ProviderError as error:
         return {"paths": [], "used": None, "reason": str(error)}
 
 
 def _providers(problems: list[str]) -> dict[str, str]:
     """What happens when the embedded texture is really loaded on each provider that ONNX Runtime offers."""
-    from solidgrain.runtime import SolidgrainError, load
+    from solidgrain.runtime import SolidgrainError, load_texture
     from solidgrain.runtime.provider import available_providers
 
     found = {}
     for provider in available_providers():
         try:
-            load(provider=provider).sample([[0.5, 0.5, 0.5]])
+            load_texture(provider=provider).sample([[0.5, 0.5, 0.5]])
             found[provider] = "works"
         except SolidgrainError as error:
             found[provider] = str(error)
@@ -94,12 +94,12 @@ def _providers(problems: list[str]) -> dict[str, str]:
 def _textures(problems: list[str]) -> dict[str, float]:
     """The embedded textures, with their largest difference from the colours in their manifests."""
     from solidgrain.bake.commands.info import TOLERANCE, probe_error
-    from solidgrain.runtime import SolidgrainError, embedded_names, load
+    from solidgrain.runtime import SolidgrainError, embedded_names, load_texture
 
     errors = {}
     for name in embedded_names():
         try:
-            errors[name] = probe_error(load(name))
+            errors[name] = probe_error(load_texture(name))
         except SolidgrainError as error:
             problems.append(str(error))
     problems += [

@@ -19,9 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from solidgrain.runtime import load
+    from solidgrain.runtime import load_texture
 
-    texture = load(arguments.source, bundle=arguments.bundle)
+    texture = load_texture(arguments.source, bundle=arguments.bundle)
     error = probe_error(texture)
     report = {**texture.bundle.manifest, "texture": texture.name, "folder": str(texture.bundle.folder), "probe_error": error}
     print(json.dumps(report, indent=2) if arguments.json else summary(texture, error))
@@ -32,10 +32,10 @@ def probe_error(texture: Texture) -> float:
     """The largest difference in colour between the manifest's probe and this machine (the bundle's own texture's)."""
     import numpy as np
 
-    from solidgrain.runtime import load
+    from solidgrain.runtime import load_texture
 
     probe = texture.bundle.manifest["probe"]
-    rgb = load(texture.bundle.folder).sample(probe["points"], probe["seed"])
+    rgb = load_texture(texture.bundle.folder).sample(probe["points"], probe["seed"])
     return float(np.abs(rgb - np.clip(probe["rgb"], 0, 1)).max())
 
 

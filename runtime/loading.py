@@ -1,0 +1,27 @@
+"""`load`: whatever can be loaded, by name or path."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from solidgrain.runtime.bundle import bundle_folder, open_bundle
+from solidgrain.runtime.space import Space, load_space
+from solidgrain.runtime.texture import DEFAULT_TEXTURE, Texture, load_texture
+
+
+def load(
+    source: str | os.PathLike[str] = DEFAULT_TEXTURE,
+    *,
+    bundle: str | os.PathLike[str] | None = None,
+    provider: str = "auto",
+    precision: str = "float32",
+    threads: int = 0,
+) -> Texture | Space:
+    """A texture, or a space where `source` is a bundle with an encoder. Arguments and errors as in `load_texture`.
+
+    Typed code that knows which it is calls `load_texture` or `load_space`.
+    """
+    if not Path(source).is_file() and open_bundle(bundle_folder(os.fspath(source))).is_space:
+        return load_space(source, provider=provider, precision=precision, threads=threads)
+    return load_texture(source, bundle=bundle, provider=provider, precision=precision, threads=threads)
