@@ -105,3 +105,17 @@ def parse_shard(text: str) -> tuple[int, int]:
     if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise argparse.ArgumentTypeError(f"expected I/N with I from 1 to N, such as 3/8, found {text!r}")
     return int(number), int(count)
+
+
+def parse_scale(text: str) -> float:
+    numbers = _numbers(text, 1)
+    if not numbers or numbers[0] <= 0:
+        raise argparse.ArgumentTypeError(f"expected pixels of the photograph per texture pixel, above 0, found {text!r}")
+    return numbers[0]
+
+
+def parse_corner(text: str) -> tuple[int, int]:
+    x, comma, y = text.partition(",")
+    if not (comma and x.isdecimal() and y.isdecimal()):
+        raise argparse.ArgumentTypeError(f"expected X,Y, two whole numbers, found {text!r}")
+    return int(x), int(y)

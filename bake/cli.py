@@ -24,6 +24,7 @@ COMMANDS = {
     "view": ("solidgrain.bake.commands.view", "look at a volume with pyvista, on screen or to a PNG"),
     "info": ("solidgrain.bake.commands.info", "say what a texture or bundle is, and check it"),
     "doctor": ("solidgrain.bake.commands.doctor", "say what this installation can do, and what is wrong with it"),
+    "encode": ("solidgrain.bake.commands.encode", "turn a photograph into a texture of a space"),
     "train": ("solidgrain.train.command", "learn a solid texture from one photograph"),
     "export": ("solidgrain.export.command", "turn a training run into a bundle of ONNX graphs"),
     "evaluate": ("solidgrain.export.evaluate_command", "measure a texture's slices against its exemplar"),

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 
 from solidgrain.bake.arguments import (
     parse_box,
+    parse_corner,
     parse_count,
     parse_matrix,
     parse_pixel_size,
     parse_positive,
+    parse_scale,
     parse_seed,
     parse_shard,
     parse_size,
@@ -30,7 +32,8 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("source", nargs="?", metavar="SOURCE", help="embedded name, bundle or texture file (granite)")
+    add("source", nargs="?", metavar="SOURCE", help="embedded name, bundle, texture file or photograph (granite)")
+    add_cut(parser.add_argument_group("the photograph"))
     _add_grid(parser.add_argument_group("the grid"))
     _add_outputs(parser.add_argument_group("the files"))
     _add_formats(parser.add_argument_group("settings of the formats"))
@@ -38,6 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--dry-run", action="store_true", help="print the plan with bytes, memory and time, and stop")
     add("--json", action="store_true", help="print one JSON object on stdout")
     add("--quiet", action="store_true", help="no progress on stderr")
+
+
+def add_cut(group: argparse._ArgumentGroup) -> None:
+    """Which part of a photograph a space encodes."""
+    add = group.add_argument
+    add("--patch-scale", type=parse_scale, metavar="S", help="photograph's pixels per texture pixel; more take in more (1)")
+    add("--crop", type=parse_corner, metavar="X,Y", help="upper left corner of what is encoded, in its pixels (the middle)")
 
 
 def _add_grid(group: argparse._ArgumentGroup) -> None:
@@ -84,7 +94,11 @@ def _add_formats(group: argparse._ArgumentGroup) -> None:
 
 def _add_work(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
-    add("--bundle", metavar="FOLDER", help="the bundle that a texture file belongs to")
+    add(
+        "--bundle",
+        metavar="FOLDER",
+        help="the bundle that a texture file belongs to, or the space that encodes a photograph (stone)",
+    )
     add("--provider", default="auto", help="auto: the fused kernel, else ONNX Runtime; kernel, cpu, cuda, directml, … (auto)")
     add("--precision", choices=("float32", "bfloat16"), help="bfloat16: faster, needs AMX (float32)")
     add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")

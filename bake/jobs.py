@@ -144,14 +144,20 @@ def _source(texture: str | None, folder: Path) -> str | None:
     return os.fspath(folder / texture) if os.sep in texture or (folder / texture).exists() else texture
 
 
-def plan_jobs(jobs: Sequence[Job], load: Load, to_do: ToDo) -> tuple[list[Planned], dict[object, Texture]]:
-    """Plans for all jobs and their textures, each loaded once, after every check. Raises what speaks against any of them."""
+def plan_jobs(
+    jobs: Sequence[Job], settle: Callable[[argparse.Namespace], None], load: Load, to_do: ToDo
+) -> tuple[list[Planned], dict[object, Texture]]:
+    """Plans for all jobs and their textures, each loaded once, after every check. Raises what speaks against any of them.
+
+    `settle` turns photographs among the sources into texture files.
+    """
     from solidgrain.bake.flags import make_plan
 
     textures: dict[object, Texture] = {}
     planned: list[Planned] = []
     for job in jobs:
         with _named(job.where):
+            settle(job.arguments)
             if job.texture not in textures:
                 textures[job.texture] = load(job.arguments)
             planned.append(Planned(job, _with_settings(make_plan(job.arguments, textures[job.texture]), job)))

@@ -29,12 +29,12 @@ from solidgrain.runtime.bundle import (
     SAMPLER,
     TEXTURE,
     file_sha256,
-    probe_patch,
 )
 from solidgrain.runtime.errors import BundleError
 from solidgrain.runtime.files import sync
 from solidgrain.runtime.lattice import untiled
 from solidgrain.runtime.noise import noise_offsets, noise_tables
+from solidgrain.runtime.probe import probe_patch
 from solidgrain.runtime.texture_file import TextureData, write_texture
 
 FloatArray = npt.NDArray[np.float32]

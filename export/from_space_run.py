@@ -21,9 +21,9 @@ from solidgrain.export.space_graphs import (
     build_encoder_graph,
     build_mapping_graph,
 )
-from solidgrain.runtime.bundle import probe_patch
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.noise import noise_offsets, noise_tables
+from solidgrain.runtime.probe import probe_patch
 from solidgrain.train.layers import Conv, Linear
 from solidgrain.train.run import pixels_sha256
 from solidgrain.train.sampler import Condition

@@ -21,9 +21,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from solidgrain.runtime.errors import BundleError
 
 MANIFEST, SAMPLER, TEXTURE, CARD = "manifest.json", "sampler.onnx", "texture.sgt.npz", "card.md"
@@ -144,12 +141,6 @@ def find_bundle(sampler_sha256: str, near: Path) -> Path | None:
         if (folder / MANIFEST).is_file() and path.is_file() and file_sha256(path) == sampler_sha256:
             return folder
     return None
-
-
-def probe_patch(size: int) -> npt.NDArray[np.float32]:
-    """A fixed picture [size, size, 3] in [0, 1] that a space's probe encodes."""
-    rows, columns, channels = np.meshgrid(np.arange(size), np.arange(size), np.arange(3), indexing="ij")
-    return np.asarray((7 * rows + 3 * columns * (channels + 1) + rows * columns // 16) % 64 / 63, np.float32)
 
 
 def _embedded_root() -> Path:

@@ -9,10 +9,7 @@ textures give equal bytes.
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.runtime.errors import BundleError
-from solidgrain.runtime.files import replacing
+from solidgrain.runtime.files import DAMAGED_ARCHIVE, write_arrays
 
 FORMAT, FORMAT_VERSION = "solidgrain-texture", 1
 
@@ -67,11 +64,7 @@ def write_texture(path: Path, texture: TextureData) -> None:
     if texture.latent is not None:
         arrays["latent"] = texture.latent
     try:
-        with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, array in arrays.items():
-                data = io.BytesIO()
-                np.lib.format.write_array(data, np.asarray(array, order="C"), allow_pickle=False)
-                archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getvalue(), zipfile.ZIP_DEFLATED)
+        write_arrays(path, arrays)
     except OSError as error:
         raise BundleError(f"{path}: cannot write the texture file ({error.strerror})") from error
 
@@ -85,7 +78,7 @@ def read_texture(path: Path) -> TextureData:
             name, sampler_sha256 = str(header.get("name", "")), str(header.get("sampler_sha256", ""))
     except OSError as error:
         raise BundleError(f"{path}: cannot read the texture file ({error})") from error
-    except (ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except DAMAGED_ARCHIVE as error:
         raise BundleError(f"{path}: not a texture file, or damaged ({type(error).__name__}); save it again") from error
     if header.get("format") != FORMAT or header.get("format_version") != FORMAT_VERSION:
         found = f"{header.get('format')} version {header.get('format_version')}"

@@ -1,88 +1,19 @@
-"""The exemplar: reading a photograph, measuring it, and cutting patches from it."""
+"""The exemplar: measuring it, and cutting patches from it."""
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from solidgrain.runtime.errors import ExemplarError
 from solidgrain.train.settings import Settings
-
-if TYPE_CHECKING:
-    import OpenImageIO as oiio
 
 FloatArray = npt.NDArray[np.float32]
 
-LARGEST = 64 * 2**20  # pixels; 768 MB as float32 RGB, far more than one texture can learn from
 NONSTATIONARY = 0.3  # above it, one texture cannot describe the image (docs/training.md)
-
-
-class Photograph(NamedTuple):
-    """What was read of a file."""
-
-    pixels: FloatArray  # sRGB-encoded, [H, W, 3] in [0, 1]
-    colorspace: str  # what the file's colours were read as
-    warning: str  # what the file declares of its colours that could not be honoured, or ""
-
-
-def read_exemplar(path: str | os.PathLike[str], smallest: int) -> FloatArray:
-    """The pixels of `read_photograph`."""
-    return read_photograph(path, smallest).pixels
-
-
-def read_photograph(path: str | os.PathLike[str], smallest: int) -> Photograph:
-    """A photograph as sRGB-encoded RGB, [H, W, 3] float32 in [0, 1].
-
-    Anything that OpenImageIO reads: 8 and 16 bit, float, grey (repeated), alpha (dropped), CMYK (converted by its reader).
-    Colours of another space that the file declares (encoding.py) are converted to sRGB and clipped. Raises ExemplarError when
-    the file is missing, unreadable, incomplete, smaller than `smallest` pixels along an axis or larger than `LARGEST` pixels.
-    """
-    import OpenImageIO as oiio
-
-    from solidgrain.train.encoding import encode
-
-    path = Path(path)
-    if not path.is_file():
-        raise ExemplarError(f"{path}: no such file; expected a photograph (PNG, JPEG, TIFF, EXR, ...)")
-    if path.stat().st_size == 0:
-        raise ExemplarError(f"{path}: the file is empty; expected a photograph (PNG, JPEG, TIFF, EXR, ...)")
-    straight = oiio.ImageSpec()
-    straight.attribute("oiio:UnassociatedAlpha", 1)  # colours as they are in the file, not multiplied by alpha
-    opened = oiio.ImageInput.open(os.fspath(path), straight)
-    if opened is None:
-        raise ExemplarError(f"{path}: not readable as an image ({_first_line(oiio.geterror())})")
-    try:
-        spec = opened.spec()
-        _check_size(path, spec, smallest)
-        pixels = opened.read_image(oiio.FLOAT)
-        error = opened.geterror()
-    finally:
-        opened.close()
-    if pixels is None or error:
-        raise ExemplarError(f"{path}: the image data is damaged or cut short ({_first_line(error)}); export it again")
-    rgb = np.asarray(pixels, np.float32)[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
-    if not np.isfinite(rgb).all():
-        raise ExemplarError(f"{path}: holds NaN or infinite pixels; expected finite colours")
-    encoded = encode(rgb, spec)
-    pixels = np.ascontiguousarray(encoded.rgb.clip(0.0, 1.0), np.float32)
-    return Photograph(pixels, encoded.colorspace, encoded.warning)
-
-
-def _check_size(path: Path, spec: oiio.ImageSpec, smallest: int) -> None:
-    width, height = spec.width, spec.height
-    if min(width, height) < smallest:
-        raise ExemplarError(
-            f"{path}: {width}x{height} pixels, expected at least {smallest}x{smallest} (one training patch); "
-            "use a larger photograph or a smaller --patch"
-        )
-    if width * height > LARGEST:
-        raise ExemplarError(f"{path}: {width}x{height} pixels, expected at most {LARGEST >> 20} megapixels; crop or resize it")
 
 
 def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:
@@ -141,7 +72,3 @@ def _half_length(correlation: npt.NDArray[np.float64]) -> float:
     lag = int(below[0])
     before, after = correlation[lag - 1], correlation[lag]
     return float(lag - 1 + (before - 0.5 * correlation[0]) / (before - after))
-
-
-def _first_line(message: str) -> str:
-    return message.strip().splitlines()[0] if message.strip() else "no further detail"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from solidgrain.bake.flags import add_arguments, make_plan
 from solidgrain.bake.modes import check_modes
+from solidgrain.bake.sources import Encoded
 from solidgrain.runtime.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,7 +27,9 @@ def run(arguments: argparse.Namespace) -> int:
     check_modes(arguments)
     if arguments.jobs:
         return run_jobs(arguments)
-    plan, texture = planned(arguments)
+    encoded = Encoded(tell_note)
+    encoded.settle(arguments)
+    plan, texture = planned(arguments, encoded)
     if not plan.outputs and not arguments.dry_run:
         raise UsageError("nothing to write: give at least one --out FILE or --preview FILE.png")
     plan = to_do(plan, arguments)
@@ -34,6 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
         report = describe(plan, texture)
         print(json.dumps(report, indent=2) if arguments.json else summary(report))
         return 0
+    encoded.save()
     if not plan.outputs:
         report = result(plan, texture, Baked([], 0.0))
     else:
@@ -43,10 +47,10 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def planned(arguments: argparse.Namespace) -> tuple[Plan, Texture]:
+def planned(arguments: argparse.Namespace, encoded: Encoded) -> tuple[Plan, Texture]:
     """The plan that the flags ask for, or the one that --plan names, and its texture."""
     if arguments.plan is None:
-        texture = load_texture(arguments)
+        texture = encoded.load(arguments) or load_texture(arguments)
         return make_plan(arguments, texture), texture
     from solidgrain.bake.evaluate import check_place
     from solidgrain.bake.schema import load_plan
@@ -66,11 +70,14 @@ def run_jobs(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.jobs import FAILED, bake_jobs, plan_jobs, read_jobs
     from solidgrain.bake.report import describe, summary
 
-    jobs, textures = plan_jobs(read_jobs(arguments.jobs, arguments), load_texture, to_do)
+    encoded = Encoded(tell_note)
+    read = read_jobs(arguments.jobs, arguments)
+    jobs, textures = plan_jobs(read, encoded.settle, lambda named: encoded.load(named) or load_texture(named), to_do)
     if arguments.dry_run:
         plans = [{"name": one.job.name, **describe(one.plan, textures[one.job.texture])} for one in jobs]
         print(json.dumps({"jobs": plans}, indent=2) if arguments.json else "\n\n".join(map(summary, plans)))
         return 0
+    encoded.save()
     report = bake_jobs(jobs, textures, bake_plan, tell_error, arguments.continue_on_error)
     if arguments.json:
         print(json.dumps({"jobs": report}, indent=2))
@@ -79,6 +86,10 @@ def run_jobs(arguments: argparse.Namespace) -> int:
 
 def tell_error(message: str) -> None:
     print(f"solidgrain: {message}", file=sys.stderr)
+
+
+def tell_note(line: str) -> None:
+    print(line, file=sys.stderr)
 
 
 def emit_job(plan: Plan, arguments: argparse.Namespace) -> dict[str, Any]:

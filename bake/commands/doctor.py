@@ -93,13 +93,14 @@ def _providers(problems: list[str]) -> dict[str, str]:
 
 def _textures(problems: list[str]) -> dict[str, float]:
     """The embedded textures, with their largest difference from the colours in their manifests."""
-    from solidgrain.bake.commands.info import TOLERANCE, probe_error
-    from solidgrain.runtime import SolidgrainError, embedded_names, load_texture
+    from solidgrain.runtime import SolidgrainError, embedded_names
+    from solidgrain.runtime.bundle import embedded_folder, open_bundle
+    from solidgrain.runtime.probe import TOLERANCE, probe_error
 
     errors = {}
     for name in embedded_names():
         try:
-            errors[name] = probe_error(load_texture(name))
+            errors[name] = probe_error(open_bundle(embedded_folder(name)))
         except SolidgrainError as error:
             problems.append(str(error))
     problems += [

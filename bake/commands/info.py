@@ -6,10 +6,12 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from solidgrain.runtime import Texture
+from solidgrain.runtime.bundle import CARD
 
-TOLERANCE = 1e-4  # in colour, against the manifest's probe
+if TYPE_CHECKING:
+    from solidgrain.runtime import Space, Texture
+
+MANY = 3  # exemplars that are named
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,42 +21,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from solidgrain.runtime import load_texture
+    from solidgrain.runtime import Texture, load
+    from solidgrain.runtime.probe import TOLERANCE, probe_error
 
-    texture = load_texture(arguments.source, bundle=arguments.bundle)
-    error = probe_error(texture)
-    report = {**texture.bundle.manifest, "texture": texture.name, "folder": str(texture.bundle.folder), "probe_error": error}
-    print(json.dumps(report, indent=2) if arguments.json else summary(texture, error))
+    loaded = load(arguments.source, bundle=arguments.bundle)
+    error = probe_error(loaded.bundle)
+    kind = "texture" if isinstance(loaded, Texture) else "space"
+    report = {**loaded.bundle.manifest, kind: loaded.name, "folder": str(loaded.bundle.folder), "probe_error": error}
+    print(json.dumps(report, indent=2) if arguments.json else summary(loaded, error, error <= TOLERANCE))
     return 0 if error <= TOLERANCE else 3
 
 
-def probe_error(texture: Texture) -> float:
-    """The largest difference in colour between the manifest's probe and this machine (the bundle's own texture's)."""
-    import numpy as np
+def summary(loaded: Texture | Space, error: float, reproduced: bool) -> str:
+    from solidgrain.runtime import Space
 
-    from solidgrain.runtime import load_texture
-
-    probe = texture.bundle.manifest["probe"]
-    rgb = load_texture(texture.bundle.folder).sample(probe["points"], probe["seed"])
-    return float(np.abs(rgb - np.clip(probe["rgb"], 0, 1)).max())
-
-
-def summary(texture: Texture, error: float) -> str:
-    manifest: dict[str, Any] = texture.bundle.manifest
+    manifest: dict[str, Any] = loaded.bundle.manifest
     training = manifest["training"]
-    exemplars = ", ".join(
-        f"{entry['exemplar']} ({entry['license']}; {entry['credit']})" for entry in training.get("exemplars", [])
-    )
-    verdict = "reproduced" if error <= TOLERANCE else "NOT REPRODUCED"
+    verdict = "reproduced" if reproduced else "NOT REPRODUCED"
     lines = [
-        f"texture    {texture.name}",
-        f"bundle     {texture.bundle.folder}, format {manifest['format_version']}, {manifest['producer']}",
+        f"{'space' if loaded.bundle.is_space else 'texture':<11}{loaded.name}",
+        f"bundle     {loaded.bundle.folder}, format {manifest['format_version']}, {manifest['producer']}",
         f"sampler    {manifest['octaves']} octaves, {manifest['hidden_layers']} layers of {manifest['width']} units",
         f"colour     {manifest['color_encoding']}",
-        f"probe      {verdict} on {texture.provider}, largest difference {error:.1g}",
+        f"probe      {verdict}, largest difference {error:.1g}",
     ]
-    if texture.provider_note:
-        lines.append(f"note       {texture.provider_note}")
+    if isinstance(loaded, Space):
+        lines.insert(3, f"encoder    {loaded.patch}² pixels to {manifest['latent']} numbers")
+    else:
+        lines.append(f"runs on    {loaded.provider}" + (f" ({loaded.provider_note})" if loaded.provider_note else ""))
     if training:
-        lines.append(f"trained    {training['iterations']} iterations, {training['minutes']:g} minutes, on {exemplars}")
+        minutes, exemplars = f"{training['minutes']:g} minutes", _exemplars(training.get("exemplars", []))
+        lines.append(f"trained    {training['iterations']} iterations, {minutes}, on {exemplars}")
     return "\n".join(lines)
+
+
+def _exemplars(entries: list[dict[str, Any]]) -> str:
+    if len(entries) > MANY:
+        return f"{len(entries)} photographs (licences and credits are in {CARD} and, one by one, in --json)"
+    return ", ".join(f"{entry['exemplar']} ({entry['license']}; {entry['credit']})" for entry in entries)

@@ -1,0 +1,159 @@
+"""What a command is given to evaluate: an embedded name, a bundle, a texture file, or a photograph that a space encodes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from solidgrain.runtime import BakeError, ExemplarError, Space, Texture, UsageError, load_space
+from solidgrain.runtime.space import DEFAULT_SPACE
+from solidgrain.runtime.texture_file import read_texture
+from solidgrain.train.photograph import SUFFIXES, read_photograph  # the one module of training that a bake shares: no torch
+
+FloatArray = npt.NDArray[np.float32]
+
+
+class Cut(NamedTuple):
+    """Which part of a photograph is encoded."""
+
+    scale: float | None = None  # photograph's pixels per texture pixel, None for 1
+    corner: tuple[int, int] | None = None  # (x, y) of its upper left one, in the photograph's pixels; None for the middle
+
+
+WHERE_IT_IS = Cut()
+Note = Callable[[str], None]
+TEXTURE_SUFFIX = ".sgt.npz"
+
+
+def _silent(line: str) -> None:
+    pass
+
+
+def is_photograph(source: str) -> bool:
+    """Whether a source is an image file, by its name; whether it can be read is another question."""
+    return Path(source).suffix.lower() in SUFFIXES
+
+
+def open_in_space(space: Space, source: str, cut: Cut = WHERE_IT_IS, on_note: Note = _silent) -> Texture:
+    """A texture file of a space, or the texture of a photograph. Raises BundleError or ExemplarError."""
+    if is_photograph(source):
+        return encode_photograph(space, Path(source), cut, on_note)
+    if cut != WHERE_IT_IS:
+        raise UsageError(f"--patch-scale and --crop: are about photographs, {source} is a texture file; leave them out")
+    return space.open(read_texture(Path(source)))
+
+
+def encode_photograph(space: Space, path: Path, cut: Cut = WHERE_IT_IS, on_note: Note = _silent) -> Texture:
+    """The texture of a photograph, called after its file. `on_note` is told in a line what of it was encoded.
+
+    Raises ExemplarError if it cannot be read, or is too small for the cut.
+    """
+    photograph = read_photograph(path, 1)
+    if photograph.warning:
+        on_note(f"warning: {path}: {photograph.warning}")
+    patch, note = cut_patch(photograph.pixels, space.patch, cut, str(path))
+    on_note(note)
+    return space.encode(patch, path.stem)
+
+
+def check_new(file: Path, overwrite: bool) -> None:
+    """Raises UsageError for a name that is no texture file's, BakeError for a file that is there and is to stay."""
+    if not file.name.endswith(TEXTURE_SUFFIX):
+        raise UsageError(f"--out {file}: expected a name that ends in {TEXTURE_SUFFIX}")
+    if not file.parent.is_dir():
+        raise UsageError(f"--out {file}: no folder {file.parent}; make it first")
+    if file.exists() and not overwrite:
+        raise BakeError(f"{file}: already exists; choose another --out, or --overwrite")
+
+
+class Encoded:
+    """The textures of photographs that are to be baked, by the texture files that they become.
+
+    A bake of a photograph saves the texture beside its first output, and its plan names that file: whoever verifies, resumes
+    or shares the work needs neither the photograph nor an encoder that agrees to the last bit.
+    """
+
+    def __init__(self, on_note: Note = _silent) -> None:
+        self.on_note = on_note
+        self.textures: dict[Path, Texture] = {}
+
+    def settle(self, arguments: argparse.Namespace) -> None:
+        """Encode the photograph that a bake's arguments name, and let them name its texture file instead.
+
+        Raises UsageError if they cut what is no photograph, BakeError if the file is another texture's, and what encoding
+        raises.
+        """
+        cut = Cut(arguments.patch_scale, arguments.crop)
+        if not arguments.source or not is_photograph(arguments.source):
+            if cut != WHERE_IT_IS:
+                raise UsageError("--patch-scale and --crop: are about photographs, and SOURCE is none; leave them out")
+            return
+        space = load_space(
+            arguments.bundle or DEFAULT_SPACE,
+            provider=arguments.provider,
+            precision=arguments.precision or "float32",
+            threads=arguments.threads,
+        )
+        texture = encode_photograph(space, Path(arguments.source), cut, self.on_note)
+        folder = next((path.parent for path in (*arguments.out, arguments.preview) if path), Path())
+        file = (folder / f"{texture.name}{TEXTURE_SUFFIX}").absolute()
+        same = self.textures.setdefault(file, texture)
+        if same.data.sha256 != texture.data.sha256:
+            raise BakeError(f"{file}: two textures would be saved there; bake them into folders of their own")
+        if file.exists() and not (arguments.overwrite or arguments.update) and read_texture(file).sha256 != texture.data.sha256:
+            raise BakeError(f"{file}: exists, and is another texture; move it away, or --overwrite")
+        arguments.source = str(file)
+
+    def load(self, arguments: argparse.Namespace) -> Texture | None:
+        """The texture that a bake's arguments name, if it is one of these."""
+        return self.textures.get(Path(arguments.source)) if arguments.source else None
+
+    def save(self) -> None:
+        """Write the texture files. Raises BundleError if one cannot be written."""
+        for file, texture in self.textures.items():
+            texture.save(file)
+
+
+def cut_patch(pixels: FloatArray, size: int, cut: Cut, name: str) -> tuple[FloatArray, str]:
+    """The patch [size, size, 3] of a photograph [H, W, 3] that is encoded, and a line that says which it is.
+
+    The cut's square is scaled down by averaging in linear light. Raises ExemplarError where the photograph is too small.
+    """
+    scale = cut.scale or 1.0
+    side, (height, width) = round(size * scale), pixels.shape[:2]
+    if side > min(height, width):
+        raise ExemplarError(
+            f"{name}: {width}x{height} pixels, expected at least {side}x{side} ({size} at --patch-scale {scale:g}); "
+            f"use a larger photograph or --patch-scale {min(height, width) / size:.2g}"
+        )
+    left, top = cut.corner if cut.corner else ((width - side) // 2, (height - side) // 2)
+    if left + side > width or top + side > height:
+        raise ExemplarError(
+            f"{name}: --crop {left},{top}: {side}x{side} pixels from there leave its {width}x{height}; "
+            f"expected at most {width - side},{height - side}"
+        )
+    share = side * side / (width * height)
+    where = "at its middle" if cut.corner is None else f"from {left},{top}"
+    advice = "; --patch-scale takes in more of it" if share < 0.25 and cut.scale is None else ""
+    note = f"{name}: encodes {side}x{side} of {width}x{height} pixels {where}, {100 * share:.0f} % of the picture{advice}"
+    return scaled(pixels[top : top + side, left : left + side], side / size), note
+
+
+def scaled(pixels: FloatArray, scale: float) -> FloatArray:
+    """A picture [H, W, 3] with `scale` of its pixels in one, averaged in linear light; sRGB-encoded as before."""
+    if scale == 1:
+        return np.ascontiguousarray(pixels)
+    import OpenImageIO as oiio
+
+    from solidgrain.bake.color import to_linear, to_srgb
+
+    height, width = (max(1, round(extent / scale)) for extent in pixels.shape[:2])
+    whole = oiio.ImageBuf(np.ascontiguousarray(to_linear(pixels)))
+    smaller = oiio.ImageBufAlgo.resize(whole, "box", 1.0, oiio.ROI(0, width, 0, height, 0, 1, 0, 3))
+    linear = np.asarray(smaller.get_pixels(oiio.FLOAT), np.float32)
+    return np.ascontiguousarray(to_srgb(linear).clip(0, 1))
