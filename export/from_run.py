@@ -19,6 +19,7 @@ from solidgrain.train.run import Run, RunFolder, open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import to_json
 from solidgrain.train.slices import UNIT
+from solidgrain.train.task import make_task
 
 TOLERANCE = 1e-4  # largest difference in colour between torch and ONNX Runtime
 
@@ -36,7 +37,8 @@ def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = Fa
             "look at its samples, or train with --variant paper"
         )
     state = trained_state(run)
-    average = Sampler(run.settings, torch.Generator())
+    average = make_task(run, torch.device("cpu")).make_model(torch.Generator())
+    assert isinstance(average, Sampler)
     try:
         average.load_state_dict(state["average"])
     except (RuntimeError, TypeError) as error:
@@ -79,6 +81,8 @@ def sampler_layers(sampler: Sampler) -> tuple[list[FloatArray], list[FloatArray]
     layers = [*sampler.hidden, sampler.output]
     weights = [layer.effective_weight().T.numpy() for layer in layers]
     biases = [layer.bias.numpy() for layer in layers]
+    weights[-1] = weights[-1] @ sampler.color_axes.numpy()
+    biases[-1] = sampler.color_mean.numpy() + biases[-1] @ sampler.color_axes.numpy()
     biases[0] = sampler.constant.numpy() @ weights[0] + biases[0]
     return weights[1:], biases
 

@@ -12,6 +12,7 @@ from solidgrain.train.noise import look_up
 from solidgrain.train.settings import Settings
 
 HIDDEN_LAYERS = 5
+NARROWEST = 0.02  # of the largest deviation of an exemplar's colours, the least that is told apart along any axis
 BINS = 4  # consecutive bins of octaves; bin l enters hidden layer l, the last hidden layer gets none
 
 
@@ -31,9 +32,14 @@ class Octaves(nn.Module):
     """The transformation model: noise at a point through learned T_i (Eq. 1). What every sampler begins with."""
 
     octave_scale: Tensor
+    color_mean: Tensor
+    color_axes: Tensor
 
     def __init__(self, settings: Settings, generator: torch.Generator) -> None:
         super().__init__()
+        # A function of the exemplar, not of the training: no part of its state.
+        self.register_buffer("color_mean", torch.zeros(3, device=generator.device), persistent=False)
+        self.register_buffer("color_axes", torch.eye(3, device=generator.device), persistent=False)
         self.directions = nn.Parameter(_start_directions(settings, generator))  # [n, 3, 3]
         self.register_buffer("octave_scale", _octave_scale(settings).to(generator.device))  # [n, 3, 3] or [n, 1, 1]
         self.offsets: Tensor | None = None  # [n, 3] texels; training shifts its slices at random instead
@@ -41,6 +47,24 @@ class Octaves(nn.Module):
     def transforms(self) -> Tensor:
         """T_i [n, 3, 3], on coordinates in units of 64 pixels."""
         return self.directions * self.octave_scale
+
+    def take_colors(self, exemplar: Tensor) -> None:
+        """Let the output layer's axes be the principal ones of an exemplar's colours [3, H, W].
+
+        Its three numbers are then deviations from the mean colour, in standard deviations along each axis: whatever the network
+        says at first has the material's hues. In plain RGB it has all hues, and unlearning them takes most of a training.
+        """
+        pixels = exemplar.flatten(1).double()
+        variances, axes = torch.linalg.eigh(torch.cov(pixels))
+        deviations = variances.clamp(min=0).sqrt()
+        deviations = deviations.clamp(min=NARROWEST * float(deviations.max()))
+        self.color_mean = pixels.mean(1).float()
+        self.color_axes = (deviations[:, None] * axes.T).float()
+
+    def colored(self, output: Tensor) -> Tensor:
+        """The last layer's output [..., 3] as rgb."""
+        exact = output if output.dtype == torch.float64 else output.float()
+        return self.color_mean.to(exact) + (exact[..., None] * self.color_axes.to(exact)).sum(-2)  # a product would be autocast
 
     def noise(self, tables: Tensor, points: Tensor, transforms: Tensor | None = None) -> Tensor:
         """eta(c): tables [n, R, R, R], points [B, P, 3] -> [B, P, n], through `transforms` in place of its own if given."""
@@ -75,8 +99,7 @@ class Sampler(Octaves):
             x = activate(y)
             if condition is not None:  # y = gamma phi(W x + A eta + b) + delta
                 x = condition.gamma[:, layer, None].to(x.dtype) * x + condition.delta[:, layer, None].to(x.dtype)
-        rgb: Tensor = self.output(x)
-        return rgb
+        return self.colored(self.output(x))
 
 
 class NoiseAtInputSampler(Octaves):
@@ -93,8 +116,7 @@ class NoiseAtInputSampler(Octaves):
         x = self.noise(tables, points)
         for dense in self.hidden:
             x = activate(dense(x))
-        rgb: Tensor = self.output(x)
-        return rgb
+        return self.colored(self.output(x))
 
 
 def make_sampler(settings: Settings, generator: torch.Generator) -> Sampler | NoiseAtInputSampler:

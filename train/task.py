@@ -64,7 +64,10 @@ class SingleExemplar:
         self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
-        return make_sampler(self.settings, generator)
+        sampler = make_sampler(self.settings, generator)
+        if self.settings.principal_colors:
+            sampler.take_colors(self.exemplar)
+        return sampler
 
     def draw(self, generator: torch.Generator) -> Batch:
         inputs = draw_noise(self.settings, generator), draw_slices(self.settings, generator)
