@@ -75,13 +75,19 @@ def space_weights(space: Space, patch: int) -> SpaceWeights:
     one = np.repeat(np.array([1, 0], np.float32), len(sampler.constant))  # of gamma, nothing of delta
     affine = [(weight, bias + one) for weight, bias in (_dense(layer) for layer in mapping.affine)]
     weights, biases = sampler_layers(sampler)
+    output = (weights[-1], biases[-1]) if encoder.color_moments else None
     return SpaceWeights(
         weights=weights,
         biases=biases,
         encoder=EncoderWeights(
-            [_kernel(layer) for layer in encoder.convolutions], [_dense(encoder.dense), _dense(encoder.code)], patch
+            [_kernel(layer) for layer in encoder.convolutions],
+            [_dense(encoder.dense), _dense(encoder.code)],
+            patch,
+            encoder.color_moments,
         ),
-        mapping=MappingWeights(octaves, [_dense(layer) for layer in mapping.style], affine, sampler.noise_weights.numpy()),
+        mapping=MappingWeights(
+            octaves, [_dense(layer) for layer in mapping.style], affine, sampler.noise_weights.numpy(), output
+        ),
     )
 
 
@@ -108,12 +114,11 @@ def check_space_agreement(space: Space, weights: SpaceWeights) -> dict[str, floa
     z = run_encoder(build_encoder_graph(weights.encoder), patches)
     differences = {"encoder.onnx": _largest(z, exact.encoder(_double(patches).permute(0, 3, 1, 2)))}
     textures = run_mapping(build_mapping_graph(weights.mapping), z, "", "")
-    change, gamma, delta = exact.mapping(_double(z))
-    transforms = (exact.sampler.directions + change) * exact.sampler.octave_scale / UNIT
+    condition = exact.condition(_double(z))
+    expected = (condition.transforms / UNIT, condition.gamma, condition.delta)
     found = [np.stack([texture.arrays()[key] for texture in textures]) for key in ("transforms", "gamma", "delta")]
     differences["mapping.onnx"] = max(
-        _largest(mine, theirs) / max(float(theirs.abs().max()), 1.0)
-        for mine, theirs in zip(found, (transforms, gamma, delta), strict=True)
+        _largest(mine, theirs) / max(float(theirs.abs().max()), 1.0) for mine, theirs in zip(found, expected, strict=True)
     )
     octaves = len(textures[0].transforms)
     sampler, points = build_sampler_graph(weights.weights, weights.biases, octaves), random_points(SEED)

@@ -30,6 +30,7 @@ class EncoderWeights:
     convolutions: Sequence[Layer]
     dense: Sequence[Layer]
     patch: int = 128  # pixels along each side of what it sees
+    color_moments: bool = False  # z ends with the patch's mean colour and contrast
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class MappingWeights:
     style: Sequence[Layer]  # f
     affine: Sequence[Layer]  # g_l, gamma and delta side by side; the one of gamma is in the bias
     noise_weights: FloatArray  # A [4, n/4, m], which an encoded texture shares with the others
+    output: Layer | None = None  # of the sampler, where z ends with colour moments: what turns them into gamma and delta
 
 
 def build_encoder_graph(weights: EncoderWeights) -> onnx.ModelProto:
@@ -55,7 +57,18 @@ def build_encoder_graph(weights: EncoderWeights) -> onnx.ModelProto:
     *hidden, (code, bias) = weights.dense
     for weight, offset in hidden:
         x = op.leaky_relu(op.gemm(x, _half(weight), _half(offset)), alpha=SLOPE)
-    return _model({"exemplar": exemplar}, {"z": op.gemm(x, _half(code), _half(bias))})
+    z = op.gemm(x, _half(code), _half(bias))
+    if weights.color_moments:
+        z = op.concat([z, *_moments(exemplar)], axis=1)
+    return _model({"exemplar": exemplar}, {"z": z})
+
+
+def _moments(exemplar: Var) -> tuple[Var, Var]:
+    """Mean colour [B, 3] and contrast [B, 1], the root mean square deviation of all channels."""
+    mean = op.reduce_mean(exemplar, axes=(2, 3), keepdims=1)
+    deviation = op.sub(exemplar, mean)
+    variance = op.reduce_mean(op.mul(deviation, deviation), axes=(1, 2, 3), keepdims=1)
+    return op.flatten(mean, axis=1), op.flatten(op.sqrt(variance), axis=1)
 
 
 def build_mapping_graph(weights: MappingWeights) -> onnx.ModelProto:
@@ -70,10 +83,22 @@ def build_mapping_graph(weights: MappingWeights) -> onnx.ModelProto:
     w = _perceptron(z, weights.style)
     styles = [op.gemm(w, op.const(weight), op.const(bias)) for weight, bias in weights.affine]
     halves = [op.split(style, op.const([width, width]), outputs_count=2, axis=1) for style in styles]
+    if weights.output is not None:
+        halves[-1] = _with_colors(z, *halves[-1], *weights.output)
     gamma, delta = (op.concat([op.unsqueeze(half[k], op.const([1])) for half in halves], axis=1) for k in (0, 1))
     count = op.concat([op.shape(z, start=0, end=1), op.const([1, 1, 1])], axis=0)
     noise_weights = op.expand(op.const(weights.noise_weights[None]), count)
     return _model({"z": z}, {"transforms": transforms, "gamma": gamma, "delta": delta, "noise_weights": noise_weights})
+
+
+def _with_colors(z: Var, gamma: Var, delta: Var, weight: FloatArray, bias: FloatArray) -> tuple[Var, Var]:
+    """The last layer's style, such that colours become mean + contrast * rgb: `solidgrain.train.space.Space`, `_with_colors`."""
+    mean = op.slice(z, op.const([-4]), op.const([-1]), op.const([1]))
+    contrast = op.slice(z, op.const([-1]), op.const([np.iinfo(np.int64).max]), op.const([1]))
+    exact = weight.astype(np.float64)
+    inverse = (np.linalg.inv(exact.T @ exact) @ exact.T).astype(np.float32)  # V transposed, [3, m]
+    offset = op.add(mean, op.mul(op.sub(contrast, op.const(np.float32(1))), op.const(bias)))
+    return op.mul(contrast, gamma), op.add(op.mul(contrast, delta), op.matmul(offset, op.const(inverse)))
 
 
 def _perceptron(x: Var, layers: Sequence[Layer]) -> Var:

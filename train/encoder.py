@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from solidgrain.train.layers import Conv, Linear, activate
+from solidgrain.train.settings import Settings
 
 # (inputs, outputs, kernel), each followed by a 2x2 average pool
 CONVOLUTIONS = (
@@ -20,11 +21,20 @@ CONVOLUTIONS = (
 )
 
 
-class Encoder(nn.Module):
-    """A CNN without any normalisation. Seven pools bring the 128² pixels that it expects down to one."""
+MOMENTS = 4  # mean red, green and blue, and their deviation from it
 
-    def __init__(self, latent: int, generator: torch.Generator) -> None:
+
+class Encoder(nn.Module):
+    """A CNN without any normalisation. Seven pools bring the 128² pixels that it expects down to one.
+
+    With `color_moments` the last four numbers of z are not learned, they are the patch's `moments`: brightness and contrast of
+    an unseen photograph are then right without having been guessed.
+    """
+
+    def __init__(self, settings: Settings, generator: torch.Generator) -> None:
         super().__init__()
+        self.color_moments = settings.color_moments
+        latent = settings.latent - (MOMENTS if settings.color_moments else 0)
         self.convolutions = nn.ModuleList(Conv(i, o, kernel, generator) for i, o, kernel in CONVOLUTIONS)
         self.dense = Linear(256, 256, generator)
         self.code = Linear(256, latent, generator, gain=1.0)
@@ -34,5 +44,12 @@ class Encoder(nn.Module):
         x = patches
         for convolution in self.convolutions:
             x = F.avg_pool2d(activate(convolution(x)), 2)
-        z: Tensor = self.code(activate(self.dense(x.flatten(1))))
-        return z
+        z: Tensor = self.code(activate(self.dense(x.flatten(1)))).to(patches)  # not in bfloat16
+        return torch.cat([z, moments(patches)], 1) if self.color_moments else z
+
+
+def moments(patches: Tensor) -> Tensor:
+    """Mean colour and contrast of patches [B, 3, H, W]: [B, 4]. Contrast is the root mean square deviation of all channels."""
+    mean = patches.mean((2, 3))
+    contrast = (patches - mean[:, :, None, None]).square().mean((1, 2, 3)).sqrt()
+    return torch.cat([mean, contrast[:, None]], 1)

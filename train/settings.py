@@ -50,6 +50,7 @@ class Settings:
 
     # Texture space (Sec. 3.2)
     latent: int = 0  # length of z; 0 for a single exemplar
+    color_moments: bool = False  # four numbers of z are the patch's mean colour and contrast, else all are learned
     encoded_patch: int = 128  # pixels along each side of the patch that E sees
     group: int = 1  # consecutive patches of a batch that show one exemplar
 
@@ -127,8 +128,10 @@ SPACE: dict[str, Any] = {"octaves": 32, "latent": 32}
 PRESETS = {
     "fast": FAST,
     "paper": PAPER,
-    # Slower rates than for one exemplar: hours of training, and what is right for one texture is wrong for the next.
-    "fast space": replace(FAST, **SPACE, principal_colors=False, sampler_rate=1e-3, sampler_half_life=8000.0, critic_half_life=8000.0),
+    # Rates fall more slowly than for one exemplar: hours of training, over many.
+    "fast space": replace(
+        FAST, **SPACE, principal_colors=False, color_moments=True, sampler_half_life=3000.0, critic_half_life=6000.0
+    ),
     "paper space": replace(PAPER, **SPACE, octave_span=15.5),  # 2^(i/2)
 }
 PRESET_ITERATIONS = {"fast": 2000, "paper": 100_000, "fast space": 30_000, "paper space": 300_000}

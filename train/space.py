@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from solidgrain.train.encoder import Encoder
+from solidgrain.train.encoder import MOMENTS, Encoder
 from solidgrain.train.layers import Linear, activate
 from solidgrain.train.sampler import HIDDEN_LAYERS, Condition, Sampler
 from solidgrain.train.settings import Settings
@@ -42,14 +42,31 @@ class Space(nn.Module):
     def __init__(self, settings: Settings, generator: torch.Generator) -> None:
         super().__init__()
         self.sampler = Sampler(settings, generator)
-        self.encoder = Encoder(settings.latent, generator)
+        self.encoder = Encoder(settings, generator)
         self.mapping = Mapping(settings, generator)
 
     def condition(self, z: Tensor) -> Condition:
-        """The textures of latent codes z [B, latent]. In float32: octaves multiply whatever is lost here."""
+        """The textures of latent codes z [B, latent]. Never in bfloat16: octaves multiply whatever is lost here."""
         with torch.autocast(z.device.type, enabled=False):
-            change, gamma, delta = self.mapping(z.float())
+            change, gamma, delta = self.mapping(z)
+            if self.encoder.color_moments:
+                gamma, delta = self._with_colors(gamma, delta, mean=z[:, -MOMENTS:-1], contrast=z[:, -1:])
             return Condition((self.sampler.directions + change) * self.sampler.octave_scale, gamma, delta)
+
+    def _with_colors(self, gamma: Tensor, delta: Tensor, mean: Tensor, contrast: Tensor) -> tuple[Tensor, Tensor]:
+        """The style whose colours are `mean + contrast * rgb`, where those of the style that is given are rgb.
+
+        Only the last hidden layer's changes: W (c gamma x + c delta + V (mean + (c - 1) b)) + b, with W V = 1, the output
+        layer's pseudoinverse.
+        """
+        weight, bias = self.sampler.output.effective_weight(), self.sampler.output.bias
+        inverse = weight.T @ torch.linalg.inv(weight @ weight.T)  # V [m, 3]
+        shift = (mean + (contrast - 1) * bias) @ inverse.T
+        last_gamma, last_delta = contrast * gamma[:, -1], contrast * delta[:, -1] + shift
+        return (
+            torch.cat([gamma[:, :-1], last_gamma[:, None]], 1),
+            torch.cat([delta[:, :-1], last_delta[:, None]], 1),
+        )
 
     def forward(self, tables: Tensor, points: Tensor, patches: Tensor) -> Tensor:
         """Colour at points [B, P, 3] of the textures of patches [G, 3, 128, 128], each for B / G images in a row: [B, P, 3]."""
