@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 WHEEL_VENV := build/wheel-venv
 
-.PHONY: install check test test-slow wheel test-wheel sanitize bench bench-bake paper-table ground-truth pictures clean
+.PHONY: install check test test-slow wheel test-wheel sanitize bench bench-bake paper-table ground-truth textures pictures clean
 
 install: $(VENV)/installed
 
@@ -67,8 +67,12 @@ paper-table: install
 ground-truth: install
 	$(BIN)/python -m tests.bench.ground_truth --minutes $(MINUTES) --resume
 
+# Figures and pictures of the embedded textures. FLAGS="--only granite" measures one of them, FLAGS=--resume those that are new.
+textures: install
+	$(BIN)/python -m docs.textures $(FLAGS)
+
 pictures: install
-	$(BIN)/python docs/pictures.py
+	$(BIN)/python -m docs.pictures $(FLAGS)
 
 clean:
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache *.egg-info

@@ -28,39 +28,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
-    from solidgrain.export.card import with_quality
-    from solidgrain.export.figures import make_figures
+    from solidgrain.export.evaluation import grain_of, measure, write_quality
     from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load_texture
-    from solidgrain.runtime.bundle import CARD
-    from solidgrain.runtime.files import replacing
-    from solidgrain.train.copying import measure_copying
-    from solidgrain.train.exemplar import read_exemplar
     from solidgrain.train.inception import Inception
-    from solidgrain.train.quality import SMALLEST, evaluate
+    from solidgrain.train.photograph import read_exemplar
+    from solidgrain.train.quality import SMALLEST
 
     if arguments.sheet:
         check_sheet(arguments.sheet, arguments.exemplar)
     inception = Inception(arguments.inception) if arguments.inception else None
     texture = load_texture(arguments.source, threads=arguments.threads)
-    manifest = texture.bundle.manifest
     exemplar = read_exemplar(arguments.exemplar, SMALLEST)
-    grain = manifest["training"].get("settings", {}).get("grain", "none")
     print(f"measuring {2 * arguments.slices} slices of {texture.name}", file=sys.stderr)
-    evaluation = evaluate(exemplar, texture.sample, arguments.slices, grain, inception)
-    copying, pairs = measure_copying(exemplar, texture.sample, grain)
-    figures = make_figures(evaluation, copying)
-    found = asdict(evaluation) | {"copying": asdict(copying)}
-    print(json.dumps(found, indent=2) if arguments.json else figures.markdown())
+    found = measure(texture, exemplar, arguments.slices, inception)
+    figures = found.figures
+    print(json.dumps(found.as_json(), indent=2) if arguments.json else figures.markdown())
     if arguments.sheet:
-        write_sheet(arguments.sheet, make_sheet(texture.name, exemplar, texture.sample, grain, pairs, figures))
+        sheet = make_sheet(texture.name, exemplar, texture.sample, grain_of(texture.bundle), found.pairs, figures)
+        write_sheet(arguments.sheet, sheet)
     if arguments.card:
-        card = texture.bundle.folder / CARD
-        written = card.read_text("utf-8") if card.is_file() else f"# {texture.name}\n"
-        with replacing(card) as file:
-            file.write(with_quality(written, figures.markdown()).encode())
+        write_quality(texture, figures)
     return 0
 
 

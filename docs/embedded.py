@@ -1,0 +1,53 @@
+"""The textures that come with the package, and the photographs that they were learned from."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from solidgrain.runtime.bundle import Bundle, embedded_folder, embedded_names, open_bundle
+from solidgrain.runtime.errors import ExemplarError
+from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.photograph import read_exemplar
+from solidgrain.train.quality import SMALLEST
+from solidgrain.train.run import pixels_sha256
+
+HERE = Path(__file__).resolve().parent
+EXEMPLARS = HERE.parents[1] / "shared" / "data" / "exemplars"  # photographs do not come with the project
+
+
+def embedded_textures() -> dict[str, Bundle]:
+    """The embedded bundles that hold one texture, by name."""
+    bundles = {name: open_bundle(embedded_folder(name)) for name in embedded_names()}
+    return {name: bundle for name, bundle in bundles.items() if not bundle.is_space}
+
+
+def exemplar_of(bundle: Bundle) -> dict[str, str]:
+    """What the manifest says of the one photograph that a texture was learned from: file name, licence, credit, sha256."""
+    entries = bundle.manifest["training"].get("exemplars", [])
+    return {"exemplar": "", "license": "", "credit": "", "sha256": "", **(entries[0] if len(entries) == 1 else {})}
+
+
+def find_photograph(bundle: Bundle, folder: Path) -> FloatArray | None:
+    """The photograph that a texture was learned from: searched for by file name in a folder and all folders in it.
+
+    None, with a line, if there is none. Raises ExemplarError if there is one of that name, but with other pixels.
+    """
+    said = exemplar_of(bundle)
+    paths = sorted(path for path in folder.rglob("*") if path.name == said["exemplar"])
+    for path in paths:
+        pixels = read_exemplar(path, SMALLEST)
+        if pixels_sha256(pixels) == said["sha256"]:
+            return pixels
+    if paths:
+        raise ExemplarError(
+            f"{paths[0]}: not the photograph that {bundle.name} was learned from (sha256 of its pixels differs from "
+            f"{said['sha256'][:12]}…, which the manifest expects); name the right folder with --exemplars"
+        )
+    say(f"{bundle.name}: no {said['exemplar'] or 'photograph'} in {folder}; left out")
+    return None
+
+
+def say(text: str) -> None:
+    """Progress: to stderr, at once."""
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,51 @@
+"""A texture measured, through the runtime, against the photograph that it was learned from."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+from solidgrain.export.card import with_quality
+from solidgrain.export.figures import Figures, make_figures
+from solidgrain.runtime import Texture
+from solidgrain.runtime.bundle import CARD, Bundle
+from solidgrain.runtime.files import replacing
+from solidgrain.train.copying import Copying, Pair, measure_copying
+from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.inception import Inception
+from solidgrain.train.quality import Evaluation, evaluate
+
+
+class Measured(NamedTuple):
+    """What was found of a texture."""
+
+    evaluation: Evaluation
+    copying: Copying
+    pairs: list[Pair]  # the patches nearest to the exemplar
+
+    @property
+    def figures(self) -> Figures:
+        return make_figures(self.evaluation, self.copying)
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self.evaluation) | {"copying": asdict(self.copying)}
+
+
+def grain_of(bundle: Bundle) -> str:
+    """The axis about which slices were turned in training, or "none"."""
+    return str(bundle.manifest["training"].get("settings", {}).get("grain", "none"))
+
+
+def measure(texture: Texture, exemplar: FloatArray, slices: int, inception: Inception | None = None) -> Measured:
+    """Measure so many axis-aligned and as many oblique slices of a texture, and whether it copies its exemplar."""
+    grain = grain_of(texture.bundle)
+    evaluation = evaluate(exemplar, texture.sample, slices, grain, inception)
+    return Measured(evaluation, *measure_copying(exemplar, texture.sample, grain))
+
+
+def write_quality(texture: Texture, figures: Figures) -> None:
+    """Write the figures into the model card of a texture's bundle."""
+    card = texture.bundle.folder / CARD
+    written = card.read_text("utf-8") if card.is_file() else f"# {texture.name}\n"
+    with replacing(card) as file:
+        file.write(with_quality(written, figures.markdown()).encode())
