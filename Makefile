@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 WHEEL_VENV := build/wheel-venv
 
-.PHONY: install check test test-slow wheel test-wheel sanitize bench bench-bake paper-table ground-truth textures pictures clean
+.PHONY: install check test test-slow wheel test-wheel sanitize bench bench-bake paper-table space-table ground-truth textures pictures clean
 
 install: $(VENV)/installed
 
@@ -63,6 +63,12 @@ bench-bake: install
 MINUTES ?= 20
 paper-table: install
 	$(BIN)/python -m tests.bench.paper_table --minutes $(MINUTES) --resume
+
+# A texture space on the photographs that it was never shown. FLAGS=--only-unadapted is the quicker half, FLAGS=--large all of it.
+BUNDLE ?= stone
+SECONDS ?= 60
+space-table: install
+	$(BIN)/python -m tests.bench.space_table --bundle $(BUNDLE) --seconds $(SECONDS) --resume $(FLAGS)
 
 ground-truth: install
 	$(BIN)/python -m tests.bench.ground_truth --minutes $(MINUTES) --resume

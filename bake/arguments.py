@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
+MOST_STEPS = 10_000  # of a sequence
+
 
 def parse_size(text: str) -> tuple[int, int, int]:
     """ "128" or "256x128x64" (x, y, z)."""
@@ -58,13 +60,21 @@ def parse_positive(text: str) -> int:
 
 
 def parse_minutes(text: str) -> float:
+    return _duration(text, "minutes")
+
+
+def parse_seconds(text: str) -> float:
+    return _duration(text, "seconds")
+
+
+def _duration(text: str, unit: str) -> float:
     try:
-        minutes = float(text)
+        duration = float(text)
     except ValueError:
-        minutes = 0.0
-    if not 0 < minutes < math.inf:
-        raise argparse.ArgumentTypeError(f"expected minutes above 0, found {text!r}")
-    return minutes
+        duration = 0.0
+    if not 0 < duration < math.inf:
+        raise argparse.ArgumentTypeError(f"expected {unit} above 0, found {text!r}")
+    return duration
 
 
 def _numbers(text: str, count: int) -> list[float]:
@@ -119,3 +129,28 @@ def parse_corner(text: str) -> tuple[int, int]:
     if not (comma and x.isdecimal() and y.isdecimal()):
         raise argparse.ArgumentTypeError(f"expected X,Y, two whole numbers, found {text!r}")
     return int(x), int(y)
+
+
+def parse_steps(text: str) -> tuple[float, ...]:
+    """One number, or FIRST:LAST:STEP, both ends included where the steps meet them."""
+    try:
+        numbers = [float(part) for part in text.split(":")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 3) or not all(map(math.isfinite, numbers)):
+        raise argparse.ArgumentTypeError(f"expected a number or FIRST:LAST:STEP, such as 0:1:0.1, found {text!r}")
+    if len(numbers) == 1:
+        return (numbers[0],)
+    first, last, step = numbers
+    steps = (last - first) / step if step else -1.0
+    if not 0 <= steps < MOST_STEPS:
+        raise argparse.ArgumentTypeError(f"expected steps that lead from {first:g} to {last:g}, found {step:g}")
+    count = math.floor(steps + 1e-9) + 1
+    return tuple(round(first + k * step, 12) for k in range(count))  # 0.3, not 0.30000000000000004
+
+
+def parse_length(text: str) -> float:
+    numbers = _numbers(text, 1)
+    if not numbers:
+        raise argparse.ArgumentTypeError(f"expected exemplar pixels, found {text!r}")
+    return numbers[0]

@@ -7,8 +7,6 @@ stagings hold; a shard stops after its slabs, and `merge` does the rest.
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -19,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from solidgrain.bake.evaluate import evaluate
+from solidgrain.bake.interrupts import uninterrupted
 from solidgrain.bake.manifest import forget_manifest, place_manifest, remove_stale, stage_manifest
 from solidgrain.bake.plan import Plan
 from solidgrain.bake.staging import Staging, open_staging
@@ -149,7 +148,7 @@ def _finish(jobs: Sequence[Job]) -> list[Notes]:
 def _put_in_place(plan: Plan, jobs: Sequence[Job], finished: Sequence[Notes]) -> list[Path]:
     """Give all files their names. An interrupt waits; an error or a kill leaves the stagings for `resume`."""
     files: list[Path] = []
-    with _uninterrupted():
+    with uninterrupted():
         for job, lines in zip(jobs, finished, strict=True):
             stage_manifest(plan, job.output, lines, job.staging.folder)  # all that needs space comes before the first name
         for job in jobs:
@@ -161,24 +160,6 @@ def _put_in_place(plan: Plan, jobs: Sequence[Job], finished: Sequence[Notes]) ->
             remove_stale(replaced, job.output, lines)
             job.staging.clear()
     return files
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Ctrl-C and SIGTERM wait until the files are in place, if this is the thread that they interrupt."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    waiting: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    handlers = [signal.signal(number, lambda number, frame: waiting.append(number)) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, handlers, strict=True):
-            signal.signal(number, handler)
-        if waiting:
-            signal.raise_signal(waiting[0])
 
 
 def _feed(plan: Plan, texture: Texture, jobs: Sequence[Job], workers: Workers, shard: Shard, on_slice: OnSlice) -> float:

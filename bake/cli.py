@@ -25,6 +25,8 @@ COMMANDS = {
     "info": ("solidgrain.bake.commands.info", "say what a texture or bundle is, and check it"),
     "doctor": ("solidgrain.bake.commands.doctor", "say what this installation can do, and what is wrong with it"),
     "encode": ("solidgrain.bake.commands.encode", "turn a photograph into a texture of a space"),
+    "blend": ("solidgrain.bake.commands.blend", "make textures between two of a space, or one that goes from one to the other"),
+    "adapt": ("solidgrain.train.adapt_command", "fit a texture of a space to a photograph that it was not trained on"),
     "train": ("solidgrain.train.command", "learn a solid texture from one photograph"),
     "export": ("solidgrain.export.command", "turn a training run into a bundle of ONNX graphs"),
     "evaluate": ("solidgrain.export.evaluate_command", "measure a texture's slices against its exemplar"),

@@ -16,9 +16,11 @@ import numpy.typing as npt
 import onnx
 import onnxruntime
 
+from solidgrain.export.blend_graph import build_blend_graph
 from solidgrain.export.sampler_graph import OPSET, build_sampler_graph
 from solidgrain.export.space_graphs import EncoderWeights, MappingWeights, build_encoder_graph, build_mapping_graph
 from solidgrain.runtime.bundle import (
+    BLEND,
     CARD,
     CRITIC,
     ENCODER,
@@ -87,7 +89,7 @@ def write_bundle(folder: Path, content: SamplerWeights | SpaceWeights, details: 
     """
     if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
         raise BundleError(f"{folder}: already exists; choose another --out, or --overwrite to replace a bundle")
-    parts = {MANIFEST, SAMPLER, TEXTURE, CARD, ENCODER, MAPPING, CRITIC}
+    parts = {MANIFEST, SAMPLER, TEXTURE, CARD, ENCODER, MAPPING, BLEND, CRITIC}
     if folder.exists() and (strange := {path.name for path in folder.iterdir()} - parts):
         raise BundleError(f"{folder}: holds {', '.join(sorted(strange))}, which is no part of a bundle; move it away first")
     folder = folder.resolve()
@@ -163,6 +165,7 @@ def _space(folder: Path, model: onnx.ModelProto, content: SpaceWeights, details:
     encoder, mapping = build_encoder_graph(content.encoder), build_mapping_graph(content.mapping)
     onnx.save(encoder, folder / ENCODER)
     onnx.save(mapping, folder / MAPPING)
+    onnx.save(build_blend_graph(content.weights, content.biases, _sizes(content)[0]), folder / BLEND)
     z = run_encoder(encoder, probe_patch(content.encoder.patch)[None])
     texture = run_mapping(mapping, z, details.name, file_sha256(folder / SAMPLER))[0]
     probe = {"z": z[0].astype(float).tolist(), **_probe(model, texture, PLACES[:2])}

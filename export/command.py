@@ -13,6 +13,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="BUNDLE", help="the bundle folder to write")
     parser.add_argument("--name", default="", help="name of the texture (default: the bundle folder's name)")
     parser.add_argument("--overwrite", action="store_true", help="replace the bundle if it exists")
+    parser.add_argument(
+        "--companion", action="store_true", help="of a space: write its critic as well, which solidgrain adapt needs"
+    )
     parser.add_argument("--json", action="store_true", help="print the bundle's manifest on stdout")
 
 
@@ -20,11 +23,13 @@ def run(arguments: argparse.Namespace) -> int:
     from solidgrain.export.from_run import export_run
     from solidgrain.export.from_space_run import export_space_run
     from solidgrain.runtime.bundle import open_bundle
+    from solidgrain.runtime.errors import UsageError
     from solidgrain.train.run import is_space
 
-    space = is_space(arguments.run)
-    export = export_space_run if space else export_run
-    folder = export(arguments.run, arguments.out, arguments.name, arguments.overwrite)
+    common, space = (arguments.run, arguments.out, arguments.name, arguments.overwrite), is_space(arguments.run)
+    if arguments.companion and not space:
+        raise UsageError(f"--companion: adapting needs a texture space, {arguments.run} is one texture's run; leave it out")
+    folder = export_space_run(*common, arguments.companion) if space else export_run(*common)
     if arguments.json:
         print(json.dumps(open_bundle(folder).manifest, indent=2))
     else:

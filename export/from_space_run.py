@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from solidgrain.export.bundle import Details, FloatArray, SpaceWeights, run_encoder, run_graph, run_mapping, write_bundle
 from solidgrain.export.card import write_card
+from solidgrain.export.companion import write_companion
 from solidgrain.export.from_run import TOLERANCE, random_points, sampler_layers, trained_state
 from solidgrain.export.sampler_graph import build_sampler_graph
 from solidgrain.export.space_graphs import (
@@ -21,6 +22,7 @@ from solidgrain.export.space_graphs import (
     build_encoder_graph,
     build_mapping_graph,
 )
+from solidgrain.runtime.bundle import CRITIC, SAMPLER, file_sha256
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.probe import probe_patch
@@ -35,13 +37,16 @@ from solidgrain.train.space_run import SpaceRun, open_space_run
 SEED = 1
 
 
-def export_space_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = False) -> Path:
+def export_space_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = False, companion: bool = False) -> Path:
     """Export a space run's averaged weights as a bundle called `name`, by default the folder's own name.
 
-    Raises TrainingError if the run has no checkpoint yet, or if torch and one of the graphs in ONNX Runtime disagree by more
-    than `TOLERANCE`; BundleError if the bundle cannot be written.
+    With `companion` the folder also gets the critic, which adapting textures needs. Raises TrainingError if the run has no
+    checkpoint yet, or if torch and one of the graphs in ONNX Runtime disagree by more than `TOLERANCE`; BundleError if the
+    bundle cannot be written.
     """
     run = open_space_run(run_folder)
+    if companion and not run.settings.trains_critic:
+        raise TrainingError(f"{run_folder}: --companion: a run with --variant {run.settings.variant} trains no critic")
     state = trained_state(run)
     average = Space(run.settings, torch.Generator())
     try:
@@ -53,7 +58,10 @@ def export_space_run(run_folder: Path, out: Path, name: str = "", overwrite: boo
     check_space_agreement(average, weights)
     name, training = name or out.name, provenance(run, state)
     details = Details(name=name, patch=run.settings.patch, training=training, card=write_card(name, training))
-    return write_bundle(out, weights, details, overwrite)
+    folder = write_bundle(out, weights, details, overwrite)
+    if companion:
+        write_companion(folder / CRITIC, state["critic"], run.settings, file_sha256(folder / SAMPLER))
+    return folder
 
 
 @torch.no_grad()

@@ -51,7 +51,7 @@ def build_sampler_graph(weights: Sequence[FloatArray], biases: Sequence[FloatArr
         "noise_weights": argument(Tensor(np.float32, (4, n // 4, width))),
         "noise": argument(Tensor(np.float32, (n, RESOLUTION, RESOLUTION, RESOLUTION))),
     }
-    cells, fractions = _locate(inputs["points"], inputs["transforms"], inputs["offsets"])
+    cells, fractions = locate(inputs["points"], inputs["transforms"], inputs["offsets"])
     eta = _look_up(inputs["noise"], cells, fractions, inputs["lattice"], n)
     rgb = _perceptron(eta, inputs["noise_weights"], inputs["gamma"], inputs["delta"], weights, biases, n)
     model = spox.build(inputs, {"rgb": rgb})
@@ -60,7 +60,7 @@ def build_sampler_graph(weights: Sequence[FloatArray], biases: Sequence[FloatArr
     return model
 
 
-def _locate(points: Var, transforms: Var, offsets: Var) -> tuple[Triple, Triple]:
+def locate(points: Var, transforms: Var, offsets: Var) -> tuple[Triple, Triple]:
     """c_i = T_i p + o_i, split: cells (float64, integers) and fractions (float32), along each axis [n, P]."""
     cells, fractions = [], []
     for axis in range(3):
@@ -75,19 +75,34 @@ def _locate(points: Var, transforms: Var, offsets: Var) -> tuple[Triple, Triple]
 
 def _look_up(noise: Var, cells: Triple, fractions: Triple, lattice: Var, octaves: int) -> Var:
     """eta_i(c) of Eq. 1, [n, P]: trilinear between eight texels of the octave's table."""
-    table = op.reshape(noise, op.const([-1]))
-    own_period = op.const(np.broadcast_to(RESOLUTION * np.eye(3), (octaves, 3, 3)).copy())
-    untiled = op.reduce_min(op.cast(op.equal(lattice, own_period), to=np.float32), keepdims=0)
+    texels = corner_texels(cells, lattice, octaves)
+    return interpolate(noise, texels, fractions, np.arange(octaves, dtype=np.int32))
+
+
+def corner_texels(cells: Triple, lattice: Var, octaves: int) -> Var:
+    """Where the eight corners of each cell, x slowest, are in their octave's table: [8n, P], whole numbers in float32."""
     (texels,) = op.if_(
-        op.cast(untiled, to=np.bool_),
+        is_untiled(lattice, octaves),
         then_branch=lambda: [op.concat(_table_texels(cells), axis=0)],
         else_branch=lambda: [op.concat(_lattice_texels(cells, lattice, octaves), axis=0)],
-    )  # [8n, P], in one octave's table
-    starts = op.const(np.tile(np.arange(octaves, dtype=np.int32) * TEXELS, 8)[:, None])
+    )
+    return texels
+
+
+def is_untiled(lattice: Var, octaves: int) -> Var:
+    """Whether every octave repeats as its table does."""
+    own_period = op.const(np.broadcast_to(RESOLUTION * np.eye(3), (octaves, 3, 3)).copy())
+    return op.cast(op.reduce_min(op.cast(op.equal(lattice, own_period), to=np.float32), keepdims=0), to=np.bool_)
+
+
+def interpolate(noise: Var, texels: Var, fractions: Triple, tables: npt.NDArray[np.int32]) -> Var:
+    """The noise between eight texels each, [n, P]; row i of the cells reads table `tables[i]`."""
+    table = op.reshape(noise, op.const([-1]))
+    starts = op.const(np.tile(tables * np.int32(TEXELS), 8)[:, None])
     index = op.add(op.cast(texels, to=np.int32), starts)
     # GatherElements: the same read as Gather, five times faster for single numbers in ONNX Runtime on the CPU.
     values = op.gather_elements(table, op.reshape(index, op.const([-1])))
-    corners = op.reshape(values, op.const([8, octaves, -1]))
+    corners = op.reshape(values, op.const([8, len(tables), -1]))
     for fraction in fractions:  # eight along x to four, along y to two, along z to one
         low, high = op.split(corners, outputs_count=2, axis=0)
         corners = op.add(low, op.mul(op.sub(high, low), fraction))
@@ -112,8 +127,7 @@ def _lattice_texels(cells: Triple, lattice: Var, octaves: int) -> list[Var]:
     period, and that number modulo 64³ is the texel. For 64 Z³ it is the table's own index. (Taking a, b and c modulo 64
     each would not do: most lattices have pivots 1, 1, |det|, and all but 64 texels would go unused.)
     """
-    entries = op.reshape(lattice, op.const([octaves, 9]))
-    basis = [[op.gather(entries, op.const([3 * row + column]), axis=1) for column in range(3)] for row in range(3)]
+    basis = lattice_entries(lattice, octaves)
     cells = _canonical(cells, basis)
 
     def corners(cell: Triple, axis: int, count: Var | None) -> list[Var]:
@@ -121,12 +135,18 @@ def _lattice_texels(cells: Triple, lattice: Var, octaves: int) -> list[Var]:
             return [op.cast(_modulo(count, op.const(np.float64(TEXELS))), to=np.float32)]
         found = []
         for neighbour in (cell[axis], op.add(cell[axis], op.const(np.float64(1)))):
-            corner = _reduce([*cell[:axis], neighbour, *cell[axis + 1 :]], basis, axis)
+            corner = reduce_cells([*cell[:axis], neighbour, *cell[axis + 1 :]], basis, axis)
             counted = corner[axis] if count is None else op.add(op.mul(count, basis[axis][axis]), corner[axis])
             found += corners(corner, axis + 1, counted)
         return found
 
     return corners(cells, 0, None)
+
+
+def lattice_entries(lattice: Var, octaves: int) -> list[list[Var]]:
+    """The entries [n, 1] of the octaves' bases, by row and column."""
+    entries = op.reshape(lattice, op.const([octaves, 9]))
+    return [[op.gather(entries, op.const([3 * row + column]), axis=1) for column in range(3)] for row in range(3)]
 
 
 def _canonical(cells: Triple, basis: Sequence[Triple]) -> Triple:
@@ -140,7 +160,7 @@ def _canonical(cells: Triple, basis: Sequence[Triple]) -> Triple:
     return [op.cast(cell, to=np.float64) for cell in whole]
 
 
-def _reduce(cell: Triple, basis: Sequence[Triple], axis: int) -> Triple:
+def reduce_cells(cell: Triple, basis: Sequence[Triple], axis: int) -> Triple:
     """One step towards the canonical representative of a cell modulo its octave's lattice, for cells that are near it.
 
     The basis is lower triangular: column k has its pivot in row k and zeros above, so one floor division per axis, in

@@ -8,6 +8,7 @@
 
     space = load("stone")                           # a bundle with an encoder
     texture = space.encode(exemplar)                # [H, W, 3] float32 in [0, 1] or uint8
+    wall = space.blend_along(texture, other, "z", 0, 96)    # one below, the other above
 
 Conventions, everywhere in this package. Coordinates are in exemplar pixels; vectors are (x, y, z), right-handed, z up;
 arrays are [z, y, x, channel], C order. Samples sit at voxel centres: voxel k of an axis is at origin + (k + 0.5) spacing.

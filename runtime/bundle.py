@@ -5,6 +5,7 @@
     texture.sgt.npz    the texture of a single-exemplar bundle
     encoder.onnx       photograph -> latent code, of a texture space
     mapping.onnx       latent code -> texture, of a texture space
+    blend.onnx         points between two textures -> colour, of a texture space
     critic.npz         what adapting a texture to a photograph needs besides (optional, in training's own format)
     card.md            the model card (optional)
 
@@ -24,7 +25,7 @@ from typing import Any
 from solidgrain.runtime.errors import BundleError
 
 MANIFEST, SAMPLER, TEXTURE, CARD = "manifest.json", "sampler.onnx", "texture.sgt.npz", "card.md"
-ENCODER, MAPPING, CRITIC = "encoder.onnx", "mapping.onnx", "critic.npz"
+ENCODER, MAPPING, BLEND, CRITIC = "encoder.onnx", "mapping.onnx", "blend.onnx", "critic.npz"
 FORMAT, FORMAT_VERSION = "solidgrain-bundle", 1
 KEYS: dict[str, type] = {
     "name": str,

@@ -41,6 +41,9 @@ class Engine(Protocol):
 
     def instance(self, tiling: Tiling, seed: int) -> Instance: ...
 
+    def check(self, tiling: Tiling) -> None:
+        """Raises EvaluationError if there is no instance with such a tiling."""
+
 
 def open_engine(bundle: Bundle, texture: TextureData, provider: str, precision: str) -> tuple[Engine, str]:
     """The engine that was asked for, and, for "auto" without the kernel, why the kernel is not it (otherwise empty).

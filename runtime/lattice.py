@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,7 @@ class Tiling:
     lattice: DoubleArray  # [n, 3, 3], lower-triangular, whole numbers
     distortion: DoubleArray  # [n], |T' - T| / |T|
     period: tuple[float, float, float]  # (x, y, z) in exemplar pixels; 0 along axes that do not tile
+    matrix: DoubleArray = field(default_factory=lambda: np.eye(3))  # [3, 3], from a grid's pixels to the texture's
 
     def check_exact(self, farthest: tuple[float, float, float]) -> None:
         """Raises EvaluationError if cells within `farthest` (x, y, z) pixels cannot be reduced in 64-bit integers."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,7 @@ DEVICE_CHUNK = 131072  # points: enough to fill an accelerator
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
+Number = TypeVar("Number", np.float32, np.float64)
 
 
 class OnnxEngine:
@@ -37,18 +39,17 @@ class OnnxEngine:
     def instance(self, tiling: Tiling, seed: int) -> OnnxInstance:
         return OnnxInstance(self, tiling, seed)
 
+    def check(self, tiling: Tiling) -> None:
+        """Any tiling will do."""
+
 
 class OnnxInstance:
-    """One instance of a texture: its inputs to the graph, all but the points, placed on the session's device once."""
+    """One instance of a texture in a session."""
 
     def __init__(self, engine: OnnxEngine, tiling: Tiling, seed: int) -> None:
         """Raises EvaluationError for a seed out of range."""
-        import onnxruntime
-
-        self.session, self.name = engine.session, engine.texture.name
-        self.device = memory_device(engine.name)
         octaves = len(tiling.transforms)
-        inputs = {
+        inputs: dict[str, npt.NDArray[Any]] = {
             "transforms": tiling.transforms,
             "lattice": tiling.lattice,
             "gamma": engine.texture.gamma,
@@ -57,8 +58,7 @@ class OnnxInstance:
             "noise": noise_tables(seed, octaves),  # checks the seed
             "offsets": noise_offsets(seed, octaves),
         }
-        place = onnxruntime.OrtValue.ortvalue_from_numpy
-        self.inputs = {name: place(np.ascontiguousarray(value), self.device) for name, value in inputs.items()}
+        self.graph = PlacedGraph(engine.session, inputs, engine.texture.name)
         self.chunk = CPU_CHUNK if engine.name.startswith("CPU") else DEVICE_CHUNK
 
     def point_tasks(self, points: DoubleArray, rgb: FloatArray) -> list[Task]:
@@ -75,24 +75,36 @@ class OnnxInstance:
 
     def _points(self, points: DoubleArray, rgb: FloatArray, start: int) -> None:
         part = points[start : start + self.chunk]
-        padded = np.concatenate([part, np.repeat(part[-1:], self.chunk - len(part), axis=0)])
-        rgb[start : start + len(part)] = self._evaluate(padded)[: len(part)]
+        rgb[start : start + len(part)] = self.graph.colors(points=padded(part, self.chunk))[: len(part)]
 
     def _voxels(self, x: DoubleArray, y: DoubleArray, z: DoubleArray, rgb: FloatArray, start: int) -> None:
         stop = min(start + self.chunk, len(rgb))
         rows, column = np.divmod(np.minimum(np.arange(start, start + self.chunk), len(rgb) - 1), len(x))
         plane, row = np.divmod(rows, len(y))
-        rgb[start:stop] = self._evaluate(np.stack([x[column], y[row], z[plane]], axis=1))[: stop - start]
+        points = np.stack([x[column], y[row], z[plane]], axis=1)
+        rgb[start:stop] = self.graph.colors(points=points)[: stop - start]
 
-    def _evaluate(self, points: DoubleArray) -> FloatArray:
-        """Colour at one chunk of points, [chunk, 3] float64 -> [chunk, 3], clipped to [0, 1].
+
+class PlacedGraph:
+    """A graph, and its inputs placed on the session's device once: all but those that change from chunk to chunk."""
+
+    def __init__(self, session: onnxruntime.InferenceSession, inputs: Mapping[str, npt.NDArray[Any]], texture: str) -> None:
+        import onnxruntime
+
+        self.session, self.name = session, texture
+        place, device = onnxruntime.OrtValue.ortvalue_from_numpy, memory_device(session.get_providers()[0])
+        self.inputs = {name: place(np.ascontiguousarray(value), device) for name, value in inputs.items()}
+
+    def colors(self, points: DoubleArray, **others: FloatArray) -> FloatArray:
+        """Colour at one chunk of points, [chunk, 3] float64 -> [chunk, 3], clipped to [0, 1]; `others` are inputs too.
 
         Raises EvaluationError if the sampler returns NaN.
         """
         binding = self.session.io_binding()
         for name, value in self.inputs.items():
             binding.bind_ortvalue_input(name, value)
-        binding.bind_cpu_input("points", points)
+        for name, array in {"points": points, **others}.items():
+            binding.bind_cpu_input(name, array)
         binding.bind_output("rgb")
         try:
             self.session.run_with_iobinding(binding)
@@ -102,3 +114,8 @@ class OnnxInstance:
         if not np.isfinite(rgb).all():
             raise EvaluationError.of_nan(self.name, points[np.flatnonzero(~np.isfinite(rgb).all(axis=1))[0]])
         return np.clip(rgb, 0.0, 1.0)
+
+
+def padded(rows: npt.NDArray[Number], count: int) -> npt.NDArray[Number]:
+    """So many rows: those, then the last of them again and again."""
+    return np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)])

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from solidgrain.runtime.blend_file import BlendData, blend_of
 from solidgrain.runtime.bundle import ENCODER, MAPPING, Bundle, bundle_folder, open_bundle
 from solidgrain.runtime.errors import BundleError, ExemplarError
+from solidgrain.runtime.mask import Mask, Vector, make_mask, make_ramp
 from solidgrain.runtime.provider import open_session
 from solidgrain.runtime.texture import Texture, make_workers, open_texture
 from solidgrain.runtime.texture_file import TextureData
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     import onnxruntime
 
 DEFAULT_SPACE = "stone"
+KNOTS = 16  # pieces of the line between two codes in which a blend's style is linear
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -86,23 +90,70 @@ class Space:
         linearly too, so that both ends are the textures themselves. Outside [0, 1] it extrapolates. Raises BundleError for
         textures of another bundle, or without a latent code.
         """
-        ends = (first.data, second.data)
-        for data in ends:
-            self._check_own(data)
+        return self.open(self._between(self.own(first), self.own(second), at, name))
+
+    def blend_along(
+        self, first: Texture, second: Texture, axis: str = "x", start: float = 0.0, stop: float = 128.0, name: str = ""
+    ) -> Texture:
+        """A texture that is the first up to `start` along an axis and the second from `stop` on, in exemplar pixels.
+
+        Raises EvaluationError for another axis or for one place twice, BundleError as `blend` does.
+        """
+        return self._in_space(first, second, make_ramp(axis, start, stop), name)
+
+    def blend_by(
+        self,
+        first: Texture,
+        second: Texture,
+        mask: npt.ArrayLike,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        spacing: float | Sequence[float] = 1.0,
+        name: str = "",
+    ) -> Texture:
+        """A texture that is the first where a mask [z, y, x] is 0, the second where it is 1, and between them in between.
+
+        The mask holds floats from 0 to 1, booleans, or uint8 or uint16, of which the largest value is 1. Its voxel k is at
+        origin + (k + 0.5) spacing (x, y, z), in exemplar pixels; it is read trilinearly, and goes on outside as it is at its
+        faces. Raises EvaluationError for what is no mask, BundleError as `blend` does.
+        """
+        return self._in_space(first, second, make_mask(mask, _triple(origin), _triple(spacing)), name)
+
+    def open(self, data: TextureData | BlendData) -> Texture:
+        """A texture of this space, ready to be evaluated. Raises BundleError if it is not of this space."""
+        return open_texture(data, self.bundle, self._provider, self._precision, self.workers)
+
+    def own(self, texture: Texture) -> TextureData:
+        """What a texture of this space owns, which lies at one place of it. Raises BundleError for one that does not."""
+        data = texture.data
+        if data.sampler_sha256 != self.bundle.sampler_sha256:
+            raise BundleError(
+                f"texture {data.name!r} is of the bundle whose sampler.onnx has sha256 {data.sampler_sha256[:12]}…, "
+                f"space {self.name!r} has {self.bundle.sampler_sha256[:12]}…; only textures of one space can be blended"
+            )
+        if isinstance(data, BlendData):
+            raise BundleError(f"texture {data.name!r} is a blend in space; expected a texture that is one everywhere")
+        if data.latent is None:
+            raise BundleError(f"texture {data.name!r} has no latent code; expected one made by encode, adapt or blend")
+        return data
+
+    def _in_space(self, first: Texture, second: Texture, mask: Mask, name: str) -> Texture:
+        """Both textures on one noise: the noise is mixed, and styles follow the line between both codes (`blend.onnx`)."""
+        ends = self.own(first), self.own(second)
+        knots = [self._between(*ends, k / KNOTS) for k in range(KNOTS + 1)]
+        return self.open(blend_of(name or f"{first.name}-{second.name}", knots, mask))
+
+    def _between(self, first: TextureData, second: TextureData, at: float, name: str = "") -> TextureData:
+        ends = (first, second)
         if at in (0, 1):
-            return self.open(replace(ends[int(at)], name=name or ends[int(at)].name))
+            return replace(ends[int(at)], name=name or ends[int(at)].name)
         mapped = [self._mapped(data.latent, "") for data in ends]
-        z = (1 - at) * np.asarray(first.data.latent) + at * np.asarray(second.data.latent)
+        z = (1 - at) * np.asarray(first.latent) + at * np.asarray(second.latent)
         between = self._mapped(z, name or f"{first.name}-{second.name}")
         arrays = {}
         for key, value in between.arrays().items():
             left = [end.arrays()[key] - of_code.arrays()[key] for end, of_code in zip(ends, mapped, strict=True)]
             arrays[key] = (value + (1 - at) * left[0] + at * left[1]).astype(value.dtype)
-        return self.open(replace(between, **arrays))
-
-    def open(self, data: TextureData) -> Texture:
-        """A texture of this space, ready to be evaluated. Raises BundleError if it is not of this space."""
-        return open_texture(data, self.bundle, self._provider, self._precision, self.workers)
+        return replace(between, **arrays)
 
     def _mapped(self, z: npt.ArrayLike | None, name: str) -> TextureData:
         code = np.asarray(z, np.float32)
@@ -115,15 +166,6 @@ class Space:
         transforms, gamma, delta, noise_weights = (part[0] for part in self._mapping.run(names, {"z": code[None]}))
         sampler = self.bundle.sampler_sha256
         return TextureData(name, sampler, transforms.astype(np.float64), gamma, delta, noise_weights, code)
-
-    def _check_own(self, data: TextureData) -> None:
-        if data.sampler_sha256 != self.bundle.sampler_sha256:
-            raise BundleError(
-                f"texture {data.name!r} is of the bundle whose sampler.onnx has sha256 {data.sampler_sha256[:12]}…, "
-                f"space {self.name!r} has {self.bundle.sampler_sha256[:12]}…; only textures of one space can be blended"
-            )
-        if data.latent is None:
-            raise BundleError(f"texture {data.name!r} has no latent code; expected one made by encode, adapt or blend")
 
 
 def _graph(bundle: Bundle, name: str, inputs: list[str], outputs: list[str]) -> onnxruntime.InferenceSession:
@@ -151,3 +193,12 @@ def _pixels(exemplar: npt.ArrayLike, smallest: int) -> FloatArray:
     if not (pixels.min() >= 0 and pixels.max() <= 1):
         raise ExemplarError(f"exemplar of {array.dtype}, expected uint8, or floats from 0 to 1")
     return pixels
+
+
+def _triple(values: float | Sequence[float]) -> Vector:
+    """Three numbers (x, y, z), or one for all of them; NaN for what is neither."""
+    try:
+        x, y, z = np.broadcast_to(np.asarray(values, np.float64), 3).tolist()
+    except (TypeError, ValueError):
+        x = y = z = np.nan
+    return (x, y, z)

@@ -6,17 +6,21 @@ import operator
 import os
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from solidgrain.runtime.blend_engine import open_blend_engine
+from solidgrain.runtime.blend_file import FORMAT as BLEND_FORMAT
+from solidgrain.runtime.blend_file import BlendData, read_blend, write_blend
 from solidgrain.runtime.bundle import TEXTURE, Bundle, bundle_folder, find_bundle, open_bundle
 from solidgrain.runtime.engine import Engine, Instance, open_engine
 from solidgrain.runtime.errors import BundleError, EvaluationError
 from solidgrain.runtime.lattice import Tiling, tiled, untiled
 from solidgrain.runtime.provider import usable_threads
-from solidgrain.runtime.texture_file import TextureData, read_texture, write_texture
+from solidgrain.runtime.texture_file import TextureData, format_of, read_texture, write_texture
 from solidgrain.runtime.workers import Workers
 
 FloatArray = npt.NDArray[np.float32]
@@ -51,10 +55,13 @@ def load_texture(
     return open_texture(data, owner, provider, precision, make_workers(threads))
 
 
-def open_texture(data: TextureData, owner: Bundle, provider: str, precision: str, workers: Workers) -> Texture:
+def open_texture(data: TextureData | BlendData, owner: Bundle, provider: str, precision: str, workers: Workers) -> Texture:
     """A texture on what evaluates it. Raises BundleError or ProviderError."""
     check_fits(data, owner)
-    engine, note = open_engine(owner, data, provider.lower(), precision)
+    if isinstance(data, BlendData):
+        engine, note = open_blend_engine(owner, data, provider.lower(), precision)
+    else:
+        engine, note = open_engine(owner, data, provider.lower(), precision)
     return Texture(data, owner, engine, workers, note)
 
 
@@ -63,10 +70,10 @@ def make_workers(threads: int) -> Workers:
     return Workers(count or usable_threads())
 
 
-def _resolve(source: str, bundle: Path | None) -> tuple[TextureData, Bundle]:
+def _resolve(source: str, bundle: Path | None) -> tuple[TextureData | BlendData, Bundle]:
     path = Path(source)
     if path.is_file():
-        data = read_texture(path)
+        data = read_blend(path) if format_of(path) == BLEND_FORMAT else read_texture(path)
         folder = bundle or find_bundle(data.sampler_sha256, path.parent)
         if folder is None:
             wanted = f"{data.sampler_sha256[:12]}… (texture {data.name!r})"
@@ -85,7 +92,7 @@ def _resolve(source: str, bundle: Path | None) -> tuple[TextureData, Bundle]:
     return read_texture(owner.folder / TEXTURE), owner
 
 
-def check_fits(data: TextureData, owner: Bundle) -> None:
+def check_fits(data: TextureData | BlendData, owner: Bundle) -> None:
     """Raises BundleError if a texture and a bundle do not belong together."""
     if data.sampler_sha256 != owner.sampler_sha256:
         raise BundleError(
@@ -95,18 +102,21 @@ def check_fits(data: TextureData, owner: Bundle) -> None:
     octaves, width, layers = (owner.manifest[key] for key in ("octaves", "width", "hidden_layers"))
     expected = {"transforms": (octaves, 3, 3), "gamma": (layers, width), "delta": (layers, width)}
     expected["noise_weights"] = (4, octaves // 4, width)
-    for name, shape in expected.items():
-        if data.arrays()[name].shape != shape:
-            raise BundleError(
-                f"{owner.folder}: {name} of texture {data.name!r} has shape {data.arrays()[name].shape}, expected {shape}; "
-                "the texture is damaged, save it again"
-            )
+    for texture in data.ends if isinstance(data, BlendData) else (data,):
+        for name, shape in expected.items():
+            if texture.arrays()[name].shape != shape:
+                raise BundleError(
+                    f"{owner.folder}: {name} of texture {data.name!r} has shape {texture.arrays()[name].shape}, "
+                    f"expected {shape}; the texture is damaged, save it again"
+                )
 
 
 class Texture:
     """A solid texture: colour at every point of space, in endless instances, one per seed."""
 
-    def __init__(self, data: TextureData, bundle: Bundle, engine: Engine, workers: Workers, provider_note: str = "") -> None:
+    def __init__(
+        self, data: TextureData | BlendData, bundle: Bundle, engine: Engine, workers: Workers, provider_note: str = ""
+    ) -> None:
         self.data, self.bundle, self.workers, self.provider_note = data, bundle, workers, provider_note
         self._engine = engine
         self._last: tuple[object, Instance] | None = None
@@ -118,7 +128,8 @@ class Texture:
 
     @property
     def provider(self) -> str:
-        """What evaluates it: a path of the fused kernel ("kernel:avx512") or an ONNX Runtime execution provider."""
+        """What evaluates it: a path of the fused kernel ("kernel:avx512") or an ONNX Runtime execution provider; both, joined
+        by a +, for a blend in space whose textures run on the kernel."""
         return self._engine.name
 
     @property
@@ -131,7 +142,7 @@ class Texture:
 
     @property
     def transforms(self) -> npt.NDArray[np.float64]:
-        """T_i [n, 3, 3], noise texels per exemplar pixel."""
+        """T_i [n, 3, 3], noise texels per exemplar pixel; of a blend in space, both textures' [2n, 3, 3]."""
         return self.data.transforms
 
     def sample(self, points: npt.ArrayLike, seed: int = 0) -> FloatArray:
@@ -243,6 +254,7 @@ class Texture:
             raise EvaluationError(f"grid reaches {reach:g} pixels from the origin, expected at most {FARTHEST:g}")
         tiling = self.tiling(shape, spacing=spacing, tile=tile, period=period, transform=transform)
         tiling.check_exact((farthest[0], farthest[1], farthest[2]))
+        self._engine.check(tiling)
         return start
 
     def _slab(self, instance: Instance, x: DoubleArray, y: DoubleArray, z: DoubleArray) -> FloatArray:
@@ -262,17 +274,21 @@ class Texture:
         """How tiling moves this texture's transforms for such a grid, and by how much (`distortion`)."""
         voxels = _positive("period", shape if period is None else period)
         step = _spacing(spacing)
-        transforms = self.transforms if transform is None else self.transforms @ _affine(transform)[:3, :3]
+        matrix = _affine(transform)[:3, :3]
+        transforms = self.transforms if transform is None else self.transforms @ matrix
         span = (voxels[2] * step[0], voxels[1] * step[1], voxels[0] * step[2])
-        key = (transforms.tobytes(), span, tile)
+        key = (transforms.tobytes(), matrix.tobytes(), span, tile)
         last = self._last_tiling  # finding lattices takes longer than a few voxels do
         if last is None or last[0] != key:
-            last = self._last_tiling = (key, tiled(transforms, span, tile))
+            last = self._last_tiling = (key, replace(tiled(transforms, span, tile), matrix=matrix))
         return last[1]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Save the texture alone (~25 KB); it loads wherever its bundle can be found."""
-        write_texture(Path(path), self.data)
+        """Save the texture alone (~25 KB; a blend's mask comes on top); it loads wherever its bundle can be found."""
+        if isinstance(self.data, BlendData):
+            write_blend(Path(path), self.data)
+        else:
+            write_texture(Path(path), self.data)
 
     def _instance(self, tiling: Tiling, seed: int) -> Instance:
         """The instance of a seed; the last one is kept, so that point after point is cheap."""
@@ -280,7 +296,7 @@ class Texture:
             number = operator.index(seed)
         except TypeError as error:
             raise EvaluationError(f"seed {seed!r}: expected a whole number from 0 to 2^64 - 1") from error
-        key = (number, tiling.transforms.tobytes(), tiling.lattice.tobytes())
+        key = (number, tiling.transforms.tobytes(), tiling.lattice.tobytes(), tiling.matrix.tobytes(), tiling.period)
         last = self._last  # another thread may replace it at any time
         if last is None or last[0] != key:
             last = self._last = (key, self._engine.instance(tiling, number))

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,32 +62,65 @@ def write_texture(path: Path, texture: TextureData) -> None:
         "name": texture.name,
         "sampler_sha256": texture.sampler_sha256,
     }
-    arrays = {"header": np.array(json.dumps(header)), **texture.arrays()}
-    if texture.latent is not None:
-        arrays["latent"] = texture.latent
-    try:
-        write_arrays(path, arrays)
-    except OSError as error:
-        raise BundleError(f"{path}: cannot write the texture file ({error.strerror})") from error
+    latent = {} if texture.latent is None else {"latent": texture.latent}
+    write_archive(path, header, {**texture.arrays(), **latent})
 
 
 def read_texture(path: Path) -> TextureData:
     """Read a texture file. Raises BundleError if it is damaged, of another version, or holds values that are not finite."""
+    header, arrays = read_archive(path, FORMAT, FORMAT_VERSION, ARRAYS, OPTIONAL)
+    return TextureData(str(header.get("name", "")), str(header.get("sampler_sha256", "")), **arrays)
+
+
+def write_archive(path: Path, header: dict[str, Any], arrays: dict[str, npt.NDArray[Any]]) -> None:
+    """Write a header and arrays as a NumPy archive, whole or not at all. Raises BundleError if it cannot be written."""
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            header = dict(json.loads(str(archive["header"])))
-            arrays = {name: archive[name] for name in (*ARRAYS, *(set(OPTIONAL) & set(archive.files)))}
-            name, sampler_sha256 = str(header.get("name", "")), str(header.get("sampler_sha256", ""))
+        write_arrays(path, {"header": np.array(json.dumps(header)), **arrays})
+    except OSError as error:
+        raise BundleError(f"{path}: cannot write the texture file ({error.strerror})") from error
+
+
+def read_archive(
+    path: Path,
+    form: str,
+    version: int,
+    needed: Mapping[str, type],
+    optional: Mapping[str, type] | None = None,
+    others: Sequence[str] = (),
+) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """The header and the arrays of a file of one format: `needed` and, if they are there, `optional` ones by their types, and
+    `others`, which the caller checks. Raises BundleError as `read_texture` does.
+    """
+    types = {**needed, **(optional or {})}
+    with _damaged(path), open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+        header = dict(json.loads(str(archive["header"])))
+        if (header.get("format"), header.get("format_version")) == (form, version):
+            names = [*needed, *others, *(name for name in optional or {} if name in archive.files)]
+            arrays = {name: archive[name] for name in names}
+        else:
+            arrays = {}
+    if not arrays:
+        found = f"{header.get('format')} version {header.get('format_version')}"
+        advice = "save it again or update solidgrain" if header.get("format") == form else "it is of another kind"
+        raise BundleError(f"{path}: {found}, expected {form} version {version}; {advice}")
+    for name, kind in types.items():
+        if name in arrays and (arrays[name].dtype != kind or not np.isfinite(arrays[name]).all()):
+            raise BundleError(f"{path}: {name} is not finite {np.dtype(kind)}; the file is damaged, save it again")
+    return header, arrays
+
+
+def format_of(path: Path) -> str:
+    """The format that a texture file says it has. Raises BundleError if it is none, or damaged."""
+    with _damaged(path), open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+        return str(dict(json.loads(str(archive["header"]))).get("format"))
+
+
+@contextmanager
+def _damaged(path: Path) -> Iterator[None]:
+    """What NumPy and zipfile raise about a file that is no archive of ours, as one of our errors."""
+    try:
+        yield
     except OSError as error:
         raise BundleError(f"{path}: cannot read the texture file ({error})") from error
     except DAMAGED_ARCHIVE as error:
         raise BundleError(f"{path}: not a texture file, or damaged ({type(error).__name__}); save it again") from error
-    if header.get("format") != FORMAT or header.get("format_version") != FORMAT_VERSION:
-        found = f"{header.get('format')} version {header.get('format_version')}"
-        raise BundleError(f"{path}: {found}, expected {FORMAT} version {FORMAT_VERSION}; save it again or update solidgrain")
-    for key, dtype in (ARRAYS | OPTIONAL).items():
-        if key not in arrays:
-            continue
-        if arrays[key].dtype != dtype or not np.isfinite(arrays[key]).all():
-            raise BundleError(f"{path}: {key} is not finite {np.dtype(dtype)}; the file is damaged, save it again")
-    return TextureData(name, sampler_sha256, **arrays)

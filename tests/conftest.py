@@ -1,4 +1,4 @@
-"""Fixtures for all tests: a toy bundle made by code, and the command line run in this process."""
+"""Fixtures for all tests: a toy bundle and a toy space made by code, and the command line run in this process."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from solidgrain.bake.cli import main
 from solidgrain.export.bundle import Details, write_bundle
 from solidgrain.runtime import Texture, load
 from tests.toy import toy_weights
+from tests.toy_space import write_toy_space
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "exemplars"
 
@@ -24,6 +25,11 @@ def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def toy(toy_folder: Path) -> Texture:
     return load(toy_folder)
+
+
+@pytest.fixture(scope="session")
+def toy_space_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_space(tmp_path_factory.mktemp("bundles") / "toyspace")
 
 
 @dataclass(frozen=True)

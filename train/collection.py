@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from solidgrain.runtime.errors import ExemplarError
-from solidgrain.train.exemplar import FloatArray, flip_by_chance, read_photograph, uniform_below
+from solidgrain.train.exemplar import FloatArray, flip_by_chance, uniform_below
+from solidgrain.train.photograph import SUFFIXES, read_photograph
 from solidgrain.train.settings import Settings
 
-SUFFIXES = frozenset([".bmp", ".exr", ".hdr", ".jpeg", ".jpg", ".jxl", ".png", ".tga", ".tif", ".tiff", ".webp"])
 LEVELS = 65535  # exemplars are kept in 16 bits: half the memory, and no photograph has more
 WRAPS = 1.5  # times the step between neighbouring rows that the step across a seam may be
 
@@ -55,13 +55,11 @@ def read_members(folder: Path, smallest: int, skip: bool, on_warning: Callable[[
     """The photographs of a folder, in the order of their names, one at a time.
 
     Files that are unreadable or have fewer than `smallest` pixels along an axis are named to `on_warning` and left out if
-    `skip` says so. Raises ExemplarError for the first of them otherwise, and for a folder that is none.
+    `skip` says so. Raises ExemplarError for the first of them otherwise, and for a folder without photographs.
     """
-    if not folder.is_dir():
-        raise ExemplarError(f"{folder}: no such folder; expected a folder of photographs (PNG, JPEG, TIFF, EXR, ...)")
-    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES):
+    for path in _photographs(folder):
         try:
-            photograph = read_photograph(path, smallest)
+            photograph = read_photograph(path, smallest, "use a larger photograph")
         except ExemplarError as error:
             if not skip:
                 raise ExemplarError(f"{error}; or leave such files out with --skip-unreadable") from error
@@ -71,6 +69,20 @@ def read_members(folder: Path, smallest: int, skip: bool, on_warning: Callable[[
             on_warning(f"{path}: {photograph.warning}")
         pixels = np.round(photograph.pixels * LEVELS).astype(np.uint16)
         yield Member(path.name, pixels, wraps(photograph.pixels), photograph.colorspace)
+
+
+def _photographs(folder: Path) -> list[Path]:
+    """The files of a folder that look like photographs by their names; hidden ones are no one's photographs."""
+    if not folder.is_dir():
+        raise ExemplarError(f"{folder}: no such folder; expected a folder of photographs (PNG, JPEG, TIFF, EXR, ...)")
+    try:
+        paths = sorted(folder.iterdir())
+    except OSError as error:
+        raise ExemplarError(f"{folder}: cannot be read ({error.strerror})") from error
+    found = [path for path in paths if path.suffix.lower() in SUFFIXES and path.name[0] != "." and not path.is_dir()]
+    if not found:
+        raise ExemplarError(f"{folder}: no photographs in it; expected files ending in {', '.join(sorted(SUFFIXES))}")
+    return found
 
 
 def choose_held_out(names: Sequence[str], wanted: int | Sequence[str], seed: int) -> frozenset[str]:
@@ -88,6 +100,15 @@ def choose_held_out(names: Sequence[str], wanted: int | Sequence[str], seed: int
     if len(names) - len(held_out) < 2:
         raise ExemplarError(f"{len(names)} photographs, {len(held_out)} of them held out; expected at least 2 to train on")
     return held_out
+
+
+def mean_covariance(members: Sequence[Member]) -> Tensor:
+    """The mean covariance [3, 3] of the members' colours, each at a contrast of one: the axes that they have in common."""
+    covariances = []
+    for member in members:
+        covariance = torch.cov(torch.from_numpy(member.exemplar).reshape(-1, 3).T.double())
+        covariances.append(covariance * 3 / covariance.trace().clamp(min=1e-9))
+    return torch.stack(covariances).mean(0)
 
 
 def wraps(exemplar: FloatArray) -> tuple[bool, bool]:

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     import torch
 
     from solidgrain.train.loop import Report
+    from solidgrain.train.processes import Processes
     from solidgrain.train.run import Run, RunFolder
     from solidgrain.train.settings import Budget, Settings
 
-INTERRUPTED = 130
+FAILED, INTERRUPTED = 1, 130
 SMALLEST_PATCH = 32  # pixels
 FIXED = (
     "preset",
@@ -82,41 +83,60 @@ def run(arguments: argparse.Namespace) -> int:
     import torch
 
     from solidgrain.runtime.provider import usable_threads
-    from solidgrain.train.loop import train
-    from solidgrain.train.processes import join_processes, local_device
+    from solidgrain.train.processes import ElsewhereError, joined, local_device, processes_here
 
     device = local_device(choose_device(arguments.device))
-    torch.set_num_threads(arguments.threads or usable_threads())
-    processes = join_processes(device)
+    torch.set_num_threads(arguments.threads or max(1, usable_threads() // processes_here()))
+    with joined(device) as processes:
+        try:
+            return train_together(arguments, device, processes)
+        except ElsewhereError:
+            return FAILED
+        except KeyboardInterrupt:
+            if processes.first:
+                raise
+            return INTERRUPTED
+
+
+def train_together(arguments: argparse.Namespace, device: torch.device, processes: Processes) -> int:
+    """Train in this process, among others perhaps. Returns the exit code; the first process says what happened."""
+    from solidgrain.train.loop import train
+
     training = processes.one_after_another(lambda: begin(arguments, device, processes.first))
-    stop = StopRequest()
-    progress = Progress(training.budget, arguments.quiet or not processes.first)
-    train(training, training.budget, device, progress.show, stop.requested, progress.warn, processes)
+    stop = StopRequest(quiet=not processes.first)
+    progress = Progress(training.budget, arguments.quiet)
+    with processes.errors_once():
+        train(training, training.budget, device, progress.show, stop.requested, progress.warn, processes)
+    stopped = processes.any(stop.requested())
+    if processes.first:
+        print(how_to_go_on(training, stopped), file=sys.stderr)
+    return INTERRUPTED if stopped else 0
+
+
+def how_to_go_on(training: RunFolder, stopped: bool) -> str:
     folder = training.folder
-    if not processes.first:
-        return 0
-    if stop.requested():
-        print(f"stopped and saved; go on with: solidgrain train --resume {folder}", file=sys.stderr)
-        return INTERRUPTED
-    way = f"next: solidgrain export {folder} --out BUNDLE"
+    if stopped:
+        return f"stopped and saved; go on with: solidgrain train --resume {folder}"
     if training.settings.noise_at_input:
-        way = f"its slices are in {folder / 'samples'}; a bundle cannot hold noise at the input"
-    print(f"{folder}: done; {way}", file=sys.stderr)
-    return 0
+        return f"{folder}: done; its slices are in {folder / 'samples'}; a bundle cannot hold noise at the input"
+    return f"{folder}: done; next: solidgrain export {folder} --out BUNDLE"
 
 
 def begin(arguments: argparse.Namespace, device: torch.device, first: bool) -> RunFolder:
     """The run to train: the one to go on with, or a new one, which the first of several processes makes."""
-    from solidgrain.train.warm_start import warm_start
+    from solidgrain.train.run import undone_on_failure
+    from solidgrain.train.warm_start import learned, warm_start
 
     if arguments.resume:
         return resume(arguments)
     if not first:
         return open_any(arguments.out)
-    training = start_space(arguments) if arguments.space else start(arguments)
-    if arguments.warm_start:
-        taken, left = warm_start(training, arguments.warm_start, device)
-        print(f"{arguments.warm_start}: took over {taken} of {taken + left} parameter tensors", file=sys.stderr)
+    other = arguments.warm_start and learned(arguments.warm_start)  # before there is a run directory
+    with undone_on_failure(arguments.out):
+        training = start_space(arguments) if arguments.space else start(arguments)
+        if other:
+            taken, left = warm_start(training, other, device)
+            print(f"{arguments.warm_start}: took over {taken} of {taken + left} parameter tensors", file=sys.stderr)
     return training
 
 
@@ -164,7 +184,8 @@ def held_out_names(text: str | None) -> int | list[str]:
 
 def start(arguments: argparse.Namespace) -> Run:
     """A new run directory for the photograph, with a warning if one texture cannot describe it."""
-    from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity, read_photograph
+    from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
+    from solidgrain.train.photograph import read_photograph
     from solidgrain.train.run import Source, create_run
     from solidgrain.train.vgg import find_weights
 
@@ -257,8 +278,8 @@ def choose_device(name: str) -> torch.device:
 class StopRequest:
     """Ctrl-C or SIGTERM asks the loop to finish its iteration and save; a second one stops at once."""
 
-    def __init__(self) -> None:
-        self._requested = False
+    def __init__(self, quiet: bool) -> None:
+        self._requested, self._quiet = False, quiet
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._request)
 
@@ -269,7 +290,8 @@ class StopRequest:
         if self._requested:
             raise KeyboardInterrupt
         self._requested = True
-        print("\nfinishing this iteration; once more to stop at once", file=sys.stderr)
+        if not self._quiet:
+            print("\nfinishing this iteration; once more to stop at once", file=sys.stderr)
 
 
 class Progress:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.train.critic import Critic
@@ -51,7 +51,7 @@ class Trainer:
         self.sampler = self.task.make_model(self.generator)
         self.average = copy.deepcopy(self.sampler).requires_grad_(False)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), betas=(0.5, 0.999))
-        self.sampler_optimiser = torch.optim.Adam(self.sampler.parameters(), betas=(0.5, 0.999))
+        self.sampler_optimiser = torch.optim.Adam(parameter_groups(self.sampler, self.settings), betas=(0.5, 0.999))
         self.reduced_precision = use_bfloat16(self.settings, device)
         self.iteration, self.seconds = 0, 0.0
         self.watch, self.setbacks = Watch(), 0
@@ -126,7 +126,7 @@ class Trainer:
             on_fake, of_fake = self.judge(fake)
             with torch.no_grad():
                 _, of_real = self.judge(real)
-        relative = self.settings.style_features == "vgg"
+        relative = self.settings.relative_gram or self.settings.style_features == "vgg"
         return style_loss(of_real, of_fake, self.settings.gram_groups, relative), on_fake.float().mean()
 
     def _set_rates(self) -> None:
@@ -134,7 +134,8 @@ class Trainer:
         for group in self.critic_optimiser.param_groups:
             group["lr"] = lowered * rate(s.critic_rate, s.critic_rate_floor, s.critic_half_life, self.iteration)
         for group in self.sampler_optimiser.param_groups:
-            group["lr"] = lowered * rate(s.sampler_rate, s.sampler_rate_floor, s.sampler_half_life, self.iteration)
+            sampler_rate = rate(s.sampler_rate, s.sampler_rate_floor, s.sampler_half_life, self.iteration)
+            group["lr"] = lowered * group["share"] * sampler_rate
 
     @torch.no_grad()
     def _update_average(self) -> None:
@@ -175,9 +176,11 @@ class Trainer:
     def _stream(self, state: dict[str, Any]) -> Tensor:
         """The state of this process's random stream. Raises TrainingError if the run has another number of processes."""
         streams: list[Tensor] = [state["generator"], *state.get("other_generators", [])]
+        if len(streams) != self.processes.count and state["iteration"] == 0:  # nothing is drawn yet, as in a warm start
+            return self.generator.get_state()
         if len(streams) != self.processes.count:
             raise TrainingError(
-                f"{self.run.folder}: saved by {len(streams)} processes, resumed by {self.processes.count}; expected the same"
+                f"{self.run.folder}: {len(streams)} processes when it was saved, {self.processes.count} now; expected as many"
             )
         return streams[self.processes.rank]
 
@@ -188,9 +191,10 @@ class Trainer:
 
     @torch.no_grad()
     def flaw(self) -> str:
-        """What makes the weights unfit for a checkpoint, or "" (see `watch.flaw`)."""
+        """What makes the weights unfit for a checkpoint, or "" (see `watch.flaw`); in the words of the first process."""
         probe = self.task.probe()
-        return flaw((self.critic, self.sampler, self.average), self.average(*probe.inputs), probe.exemplars)
+        found = flaw((self.critic, self.sampler, self.average), self.average(*probe.inputs), probe.exemplars)
+        return str(self.processes.gathered(found)[0])
 
     def gone_back(self, trouble: str) -> Trainer:
         """A trainer at the last checkpoint, or at the start, with half the rates and another random stream.
@@ -230,7 +234,7 @@ def train(
 
     Leaves a checkpoint and a sample behind in either case. A training that diverges (`watch`) goes back to its last
     checkpoint, twice at most, and `on_warning` is told; then it raises TrainingError. No checkpoint is ever replaced by a
-    state that is in doubt. Of several `processes`, all call this, and the first alone writes and reports.
+    state that is in doubt. Of several `processes`, all call this, and the first alone writes, reports and warns.
     """
     trainer = Trainer(run, device, processes)
     trainer.load()
@@ -245,10 +249,11 @@ def train(
         trouble = trainer.watch.see(style, report.critic_loss) or (trainer.flaw() if due else "")
         if trouble:
             trainer = trainer.gone_back(trouble)
-            on_warning(
-                f"iteration {report.iteration}: the training diverged ({trouble}); "
-                f"it goes on from iteration {trainer.iteration}, at half the rates"
-            )
+            if processes.first:
+                on_warning(
+                    f"iteration {report.iteration}: the training diverged ({trouble}); "
+                    f"it goes on from iteration {trainer.iteration}, at half the rates"
+                )
             continue
         if trainer.iteration % settings.report_every == 0 and processes.first:
             run.append_stats(vars(report))
@@ -257,13 +262,22 @@ def train(
             _write_sample(trainer)
         if due and not trainer.watch.doubt():
             trainer.save()
-    if doubt := trainer.watch.doubt() or trainer.flaw():
-        on_warning(f"iteration {trainer.iteration} is not saved ({doubt}); the last checkpoint stays")
-    else:
+    doubt = trainer.watch.doubt() or trainer.flaw()
+    if not doubt:
         trainer.save()
     if processes.first:
+        if doubt:
+            on_warning(f"iteration {trainer.iteration} is not saved ({doubt}); the last checkpoint stays")
         _write_sample(trainer)
     return report
+
+
+def parameter_groups(model: nn.Module, settings: Settings) -> list[dict[str, Any]]:
+    """The sampler's parameters with their shares of its learning rate: T_i and Q, which make streaks when rushed, apart."""
+    octaves, others = [], []
+    for name, parameter in model.named_parameters():
+        (octaves if "directions" in name or ".octaves." in name else others).append(parameter)
+    return [{"params": others, "share": 1.0}, {"params": octaves, "share": settings.octave_rate}]
 
 
 def use_bfloat16(settings: Settings, device: torch.device) -> bool:

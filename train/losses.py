@@ -47,13 +47,13 @@ def style_loss(real: Sequence[Tensor], fake: Sequence[Tensor], groups: int, rela
     The Gram matrix is F F^T / pixels, the normalisation of the authors' code; the equation's 1 / (4 N² M²) differs from it
     by a factor per layer. The batch is so many groups of consecutive patches, each of one exemplar: matrices are averaged
     within a group before they are compared, for a mean is a less noisy target than any one patch. `relative` divides each
-    layer's term by the mean absolute entry of the real matrix, for features whose scale is not ours to train.
+    layer's and group's term by the mean absolute entry of its real matrix: the scale of the features then does not matter.
     """
     terms = []
     for of_real, of_fake in zip(real, fake, strict=True):
         wanted, found = gram_matrices(of_real, groups), gram_matrices(of_fake, groups)
-        difference = (wanted - found).abs().mean()
-        terms.append(difference / wanted.abs().mean() if relative else difference)
+        difference = (wanted - found).abs().mean((1, 2))
+        terms.append((difference / wanted.abs().mean((1, 2)) if relative else difference).mean())
     return torch.stack(terms).mean()
 
 

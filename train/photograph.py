@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float32]
 
+ADVICE = "use a larger photograph or a smaller --patch"
 LARGEST = 64 * 2**20  # pixels; 768 MB as float32 RGB, far more than one texture can learn from
 SUFFIXES = frozenset([".bmp", ".exr", ".hdr", ".jpeg", ".jpg", ".jxl", ".png", ".tga", ".tif", ".tiff", ".webp"])
 
@@ -33,12 +34,13 @@ def read_exemplar(path: str | os.PathLike[str], smallest: int) -> FloatArray:
     return read_photograph(path, smallest).pixels
 
 
-def read_photograph(path: str | os.PathLike[str], smallest: int) -> Photograph:
+def read_photograph(path: str | os.PathLike[str], smallest: int, advice: str = ADVICE) -> Photograph:
     """A photograph as sRGB-encoded RGB, [H, W, 3] float32 in [0, 1].
 
     Anything that OpenImageIO reads: 8 and 16 bit, float, grey (repeated), alpha (dropped), CMYK (converted by its reader).
     Colours of another space that the file declares (encoding.py) are converted to sRGB and clipped. Raises ExemplarError when
-    the file is missing, unreadable, incomplete, smaller than `smallest` pixels along an axis or larger than `LARGEST` pixels.
+    the file is missing, unreadable, incomplete, smaller than `smallest` pixels along an axis (`advice` says what to do then) or
+    larger than `LARGEST` pixels.
     """
     import OpenImageIO as oiio
 
@@ -56,7 +58,7 @@ def read_photograph(path: str | os.PathLike[str], smallest: int) -> Photograph:
         raise ExemplarError(f"{path}: not readable as an image ({_first_line(oiio.geterror())})")
     try:
         spec = opened.spec()
-        _check_size(path, spec, smallest)
+        _check_size(path, spec, smallest, advice)
         pixels = opened.read_image(oiio.FLOAT)
         error = opened.geterror()
     finally:
@@ -71,12 +73,11 @@ def read_photograph(path: str | os.PathLike[str], smallest: int) -> Photograph:
     return Photograph(pixels, encoded.colorspace, encoded.warning)
 
 
-def _check_size(path: Path, spec: oiio.ImageSpec, smallest: int) -> None:
+def _check_size(path: Path, spec: oiio.ImageSpec, smallest: int, advice: str) -> None:
     width, height = spec.width, spec.height
     if min(width, height) < smallest:
         raise ExemplarError(
-            f"{path}: {width}x{height} pixels, expected at least {smallest}x{smallest} (one training patch); "
-            "use a larger photograph or a smaller --patch"
+            f"{path}: {width}x{height} pixels, expected at least {smallest}x{smallest} (one training patch); {advice}"
         )
     if width * height > LARGEST:
         raise ExemplarError(f"{path}: {width}x{height} pixels, expected at most {LARGEST >> 20} megapixels; crop or resize it")

@@ -7,20 +7,36 @@ twice, outside any forward that such a wrapper would see.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from solidgrain.runtime.errors import TrainingError
+
 T = TypeVar("T")
+PATIENCE = timedelta(hours=1)  # that a process waits for the others: the first alone reads the folder and draws the samples
+
+
+class ElsewhereError(TrainingError):
+    """Another process of the training has failed, and has said why."""
+
+
+class LostProcessError(TrainingError):
+    """Another process of the training has ended without a word."""
 
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among those of the training. Alone, everything here does nothing."""
+    """This process among those of the training. Alone, everything here does nothing.
+
+    What involves all must be called by all of them, in the same order. It raises LostProcessError if one of them is gone.
+    """
 
     rank: int = 0
     count: int = 1
@@ -35,50 +51,106 @@ class Processes:
         if self.count == 1:
             return
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-        flat = torch.cat([gradient.flatten() for gradient in gradients])
-        dist.all_reduce(flat)
-        flat /= self.count
-        start = 0
-        for gradient in gradients:
-            gradient.copy_(flat[start : start + gradient.numel()].view_as(gradient))
-            start += gradient.numel()
+        flat = self.mean(torch.cat([gradient.flatten() for gradient in gradients]))
+        averages = torch.split(flat, [gradient.numel() for gradient in gradients])
+        for gradient, average in zip(gradients, averages, strict=True):
+            gradient.copy_(average.view_as(gradient))
 
     def mean(self, values: Tensor) -> Tensor:
-        """The mean of small tensors, so that all processes decide alike."""
-        if self.count > 1:
+        """The mean of a tensor over all processes, the same bits in each of them, so that all decide alike."""
+        if self.count == 1:
+            return values
+        with self._together():
             dist.all_reduce(values)
         return values / self.count
 
     def any(self, mine: bool) -> bool:
         """Whether it is so for at least one process."""
-        return mine if self.count == 1 else any(self.gathered(mine))
-
-    def one_after_another(self, make: Callable[[], T]) -> T:
-        """What `make` gives, called by the first process before the others."""
-        made = make() if self.first else None
-        self.gathered(None)
-        return make() if made is None else made
+        return any(self.gathered(mine))
 
     def gathered(self, value: Any) -> list[Any]:
         """The value of every process, by rank."""
         values = [value]
         if self.count > 1:
             values = [None] * self.count
-            dist.all_gather_object(values, value)
+            with self._together():
+                dist.all_gather_object(values, value)
         return values
 
+    def one_after_another(self, make: Callable[[], T]) -> T:
+        """What `make` gives, called by the first process before the others.
 
-def join_processes(device: torch.device) -> Processes:
-    """The processes that torchrun started together with this one, or this one alone."""
+        Where it fails, all of them end here: those in which it does with its error, the others with `ElsewhereError`.
+        """
+        made: list[T] = []
+        failure: Exception | None = None
+        for my_turn in (self.first, not self.first):
+            if my_turn:
+                try:
+                    made.append(make())
+                except Exception as error:
+                    failure = error
+            if self.any(failure is not None):
+                raise failure or ElsewhereError("another process of this training has failed")
+        return made[0]
+
+    @contextmanager
+    def errors_once(self) -> Iterator[None]:
+        """Of an error that all processes run into alike, the first keeps the message, the others raise `ElsewhereError`."""
+        try:
+            yield
+        except LostProcessError:
+            raise
+        except TrainingError as error:
+            if self.first:
+                raise
+            raise ElsewhereError("the first process has failed likewise") from error
+
+    @contextmanager
+    def _together(self) -> Iterator[None]:
+        try:
+            yield
+        except RuntimeError as error:
+            reason = f"another one has ended or does not answer ({_first_line(error)}); go on with --resume once all can"
+            raise LostProcessError(f"process {self.rank} of {self.count}: {reason}") from error
+
+
+@contextmanager
+def joined(device: torch.device) -> Iterator[Processes]:
+    """The processes that torchrun started together with this one, or this one alone; those that have met, if they have.
+
+    Raises TrainingError if they do not find each other.
+    """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
-        return Processes()
-    if not dist.is_initialized():
-        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
-    return Processes(dist.get_rank(), count)
+        yield Processes()
+        return
+    if dist.is_initialized():
+        yield Processes(dist.get_rank(), count)
+        return
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    try:
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=PATIENCE)
+    except (RuntimeError, ValueError) as error:
+        reason = f"WORLD_SIZE is {count}, but the processes do not meet ({_first_line(error)}); start them with torchrun"
+        raise TrainingError(reason) from error
+    try:
+        yield Processes(dist.get_rank(), count)
+    finally:
+        dist.destroy_process_group()
+
+
+def processes_here() -> int:
+    """How many of them share this machine."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 
 def local_device(device: torch.device) -> torch.device:
     """The device of this process: with torchrun, the GPU of its number on this machine."""
     number = os.environ.get("LOCAL_RANK")
     return torch.device(device.type, int(number)) if device.type == "cuda" and number else device
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -4,7 +4,7 @@ RUN/options.json     settings, exemplar, provenance
 RUN/exemplar.npy     the pixels that it trains on, [H, W, 3] float32
 RUN/stats.jsonl      one line per report: iteration, seconds, losses
 RUN/samples/*.png    the exemplar, an axis-aligned and an oblique slice
-RUN/checkpoint.pt    everything that the next iteration depends on, replaced whole
+RUN/checkpoint.pt    everything that the next iteration depends on, replaced whole; torch's format, packed (packing.py)
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import shutil
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -27,11 +28,14 @@ from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.files import replacing
 from solidgrain.train import settings as settings_module
 from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.packing import pack, unpack
 from solidgrain.train.settings import Budget, Settings
 
 PARTS = ("critic", "sampler", "average", "critic_optimiser", "sampler_optimiser")  # the state of each is in a checkpoint
 CHECKPOINT_KEYS = {*PARTS, "iteration", "seconds", "generator"}
 CHECKPOINT, OPTIONS, EXEMPLAR, STATS = "checkpoint.pt", "options.json", "exemplar.npy", "stats.jsonl"
+EXEMPLARS, SAMPLES = "exemplars", "samples"
+CONTENTS = (CHECKPOINT, OPTIONS, EXEMPLAR, STATS, EXEMPLARS, SAMPLES)
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ class RunFolder:
         buffer = io.BytesIO()  # torch's own writer turns a full disk into errors of many types
         torch.save(state, buffer)
         with self._written(CHECKPOINT), replacing(self.folder / CHECKPOINT) as file:
-            file.write(buffer.getbuffer())
+            file.write(pack(buffer.getbuffer()))
 
     def load_checkpoint(self) -> dict[str, Any] | None:
         """The last complete checkpoint, or None before the first."""
@@ -66,7 +70,7 @@ class RunFolder:
         if not path.exists():
             return None
         try:
-            state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+            state: dict[str, Any] = torch.load(io.BytesIO(unpack(path.read_bytes())), map_location="cpu", weights_only=True)
             if missing := CHECKPOINT_KEYS - state.keys():
                 raise KeyError(f"no {', '.join(sorted(missing))}")
         except Exception as error:  # torch raises a dozen unrelated types for damaged files
@@ -147,14 +151,40 @@ def is_space(folder: Path) -> bool:
 
 @contextmanager
 def creating(folder: Path) -> Iterator[None]:
-    """A run directory in the making. Raises TrainingError if the folder already holds a run or cannot be written."""
+    """A run directory in the making. Raises TrainingError if the folder already holds a run or cannot be written.
+
+    Whatever goes wrong inside, nothing half-made is left behind.
+    """
     if (folder / OPTIONS).exists():
         raise TrainingError(f"{folder}: already holds a run; continue it with --resume {folder}, or choose another --out")
     try:
-        (folder / "samples").mkdir(parents=True, exist_ok=True)
-        yield
+        with undone_on_failure(folder):
+            (folder / SAMPLES).mkdir(parents=True, exist_ok=True)
+            yield
     except OSError as error:
         raise TrainingError(f"{folder}: cannot write the run directory ({error.strerror})") from error
+
+
+@contextmanager
+def undone_on_failure(folder: Path) -> Iterator[None]:
+    """What is made of a run directory inside goes away again if it fails there; what was in the folder before stays."""
+    before = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if OPTIONS in before:  # a run, and perhaps a training that goes on in it
+        yield
+        return
+    absent = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        yield
+    except BaseException:
+        for path in (folder / name for name in CONTENTS if name not in before):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+        with suppress(OSError):  # not empty: something else is in it by now
+            for path in absent:
+                path.rmdir()
+        raise
 
 
 def write_options(run: RunFolder, specific: dict[str, Any]) -> None:
@@ -182,7 +212,7 @@ def common_options(folder: Path, options: dict[str, Any]) -> tuple[Path, Setting
 
 
 def pixels_sha256(pixels: np.ndarray[Any, Any]) -> str:
-    return hashlib.sha256(np.ascontiguousarray(pixels).tobytes()).hexdigest()
+    return hashlib.sha256(np.ascontiguousarray(pixels).data).hexdigest()
 
 
 def source_revision() -> str:

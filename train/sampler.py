@@ -48,17 +48,16 @@ class Octaves(nn.Module):
         """T_i [n, 3, 3], on coordinates in units of 64 pixels."""
         return self.directions * self.octave_scale
 
-    def take_colors(self, exemplar: Tensor) -> None:
-        """Let the output layer's axes be the principal ones of an exemplar's colours [3, H, W].
+    def take_colors(self, mean: Tensor, covariance: Tensor) -> None:
+        """Let the output layer's axes be the principal ones of colours with this mean [3] and covariance [3, 3].
 
         Its three numbers are then deviations from the mean colour, in standard deviations along each axis: whatever the network
         says at first has the material's hues. In plain RGB it has all hues, and unlearning them takes most of a training.
         """
-        pixels = exemplar.flatten(1).double()
-        variances, axes = torch.linalg.eigh(torch.cov(pixels))
+        variances, axes = torch.linalg.eigh(covariance.double())
         deviations = variances.clamp(min=0).sqrt()
         deviations = deviations.clamp(min=NARROWEST * float(deviations.max()))
-        self.color_mean = pixels.mean(1).float()
+        self.color_mean = mean.float()
         self.color_axes = (deviations[:, None] * axes.T).float()
 
     def colored(self, output: Tensor) -> Tensor:

@@ -59,7 +59,8 @@ class Space(nn.Module):
         Only the last hidden layer's changes: W (c gamma x + c delta + V (mean + (c - 1) b)) + b, with W V = 1, the output
         layer's pseudoinverse.
         """
-        weight, bias = self.sampler.output.effective_weight(), self.sampler.output.bias
+        axes, output = self.sampler.color_axes.to(gamma), self.sampler.output
+        weight, bias = axes.T @ output.effective_weight(), output.bias @ axes
         inverse = weight.T @ torch.linalg.inv(weight @ weight.T)  # V [m, 3]
         shift = (mean + (contrast - 1) * bias) @ inverse.T
         last_gamma, last_delta = contrast * gamma[:, -1], contrast * delta[:, -1] + shift

@@ -17,6 +17,7 @@ from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.files import replacing
 from solidgrain.train.collection import Member, choose_held_out
 from solidgrain.train.run import (
+    EXEMPLARS,
     RunFolder,
     Source,
     common_options,
@@ -27,8 +28,6 @@ from solidgrain.train.run import (
     write_options,
 )
 from solidgrain.train.settings import Budget, Settings
-
-EXEMPLARS = "exemplars"
 
 
 @dataclass(frozen=True)
@@ -63,8 +62,10 @@ def create_space_run(
     `source` gives the licence and the credit of them all. Raises TrainingError if the folder already holds a run or cannot be
     written, ExemplarError if the members cannot be trained on.
     """
+    if (folder / EXEMPLARS).exists():
+        raise TrainingError(f"{folder / EXEMPLARS}: is there already, without a run; remove it or choose another --out")
     with creating(folder):
-        (folder / EXEMPLARS).mkdir(exist_ok=True)
+        (folder / EXEMPLARS).mkdir()
         entries: list[dict[str, Any]] = []
         for number, member in enumerate(members):
             with replacing(_file(folder, number)) as file:
@@ -84,18 +85,22 @@ def open_space_run(folder: Path) -> SpaceRun:
     with opening(folder) as options:
         if "exemplars" not in options:
             raise TrainingError(f"{folder}: the run of a single exemplar; expected one of a texture space")
-        entries, members = options["exemplars"], []
-        for number, entry in enumerate(entries):
-            pixels = np.load(_file(folder, number), mmap_mode="r", allow_pickle=False)
-            down, across = entry["wraps"]
-            members.append(Member(entry["exemplar"], pixels, (bool(down), bool(across)), entry["colorspace"]))
+        entries = options["exemplars"]
+        members = tuple(_read_member(_file(folder, number), entry) for number, entry in enumerate(entries))
         held_out = frozenset(entry["exemplar"] for entry in entries if entry["held_out"])
         common = common_options(folder, options)
-        run = SpaceRun(*common, tuple(members), held_out, str(options["license"]), str(options["credit"]))
-    for number, (entry, member) in enumerate(zip(entries, members, strict=True)):
-        if pixels_sha256(member.pixels) != entry["sha256"]:
-            raise TrainingError(f"{_file(folder, number)}: not the pixels that the run was started with (sha256 differs)")
-    return run
+        return SpaceRun(*common, members, held_out, str(options["license"]), str(options["credit"]))
+
+
+def _read_member(path: Path, entry: dict[str, Any]) -> Member:
+    try:
+        pixels = np.lib.format.open_memmap(path, mode="r")
+    except (OSError, ValueError, EOFError) as error:
+        raise TrainingError(f"{path}: missing or damaged; put it back, or start the run again elsewhere") from error
+    if pixels_sha256(pixels) != entry["sha256"]:
+        raise TrainingError(f"{path}: not the pixels that the run was started with (sha256 differs)")
+    down, across = entry["wraps"]
+    return Member(entry["exemplar"], pixels, (bool(down), bool(across)), entry["colorspace"])
 
 
 def _file(folder: Path, number: int) -> Path:

@@ -66,7 +66,8 @@ class SingleExemplar:
     def make_model(self, generator: torch.Generator) -> nn.Module:
         sampler = make_sampler(self.settings, generator)
         if self.settings.principal_colors:
-            sampler.take_colors(self.exemplar)
+            pixels = self.exemplar.flatten(1).double()
+            sampler.take_colors(pixels.mean(1), torch.cov(pixels))
         return sampler
 
     def draw(self, generator: torch.Generator) -> Batch:
@@ -88,7 +89,11 @@ class TextureSpace:
         self.members = run.trained_on
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
-        return Space(self.settings, generator)
+        space = Space(self.settings, generator)
+        if self.settings.principal_colors:  # axes that all have in common; mean and contrast are each texture's own
+            device = generator.device
+            space.sampler.take_colors(torch.zeros(3, device=device), collection.mean_covariance(self.members).to(device))
+        return space
 
     def draw(self, generator: torch.Generator) -> Batch:
         settings, device = self.settings, self.device

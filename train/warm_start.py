@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,33 +14,41 @@ from solidgrain.train.run import RunFolder, is_space, open_run
 from solidgrain.train.space_run import open_space_run
 
 
-def warm_start(run: RunFolder, other: Path, device: torch.device) -> tuple[int, int]:
-    """Give a new run a checkpoint at iteration 0 with the weights of another run, its critic's and its average's.
-
-    A single exemplar's sampler fits a space's as far as shapes go: all but what depends on the number of octaves. Returns how
-    many parameter tensors were taken over, and how many start afresh. Raises TrainingError if there is nothing to take.
-    """
+def learned(other: Path) -> dict[str, Any]:
+    """The checkpoint of another run, of either kind. Raises TrainingError if there is none to begin with."""
     found = (open_space_run(other) if is_space(other) else open_run(other)).load_checkpoint()
     if found is None:
         raise TrainingError(f"--warm-start {other}: no checkpoint yet; expected a run that has been trained")
+    return found
+
+
+def warm_start(run: RunFolder, found: dict[str, Any], device: torch.device) -> tuple[int, int]:
+    """Give a new run a checkpoint at iteration 0 with the weights of another one: its critic's and its average's.
+
+    A single exemplar's sampler fits a space's as far as shapes go: all but what depends on the number of octaves. Returns how
+    many parameter tensors were taken over, and how many start afresh. Raises TrainingError if no layer of the sampler fits.
+    """
     trainer = Trainer(run, device)
-    taken, left = _take_over(trainer.critic, found["critic"])
-    for model in (trainer.sampler, trainer.average):
-        of_model = _take_over(model, found["average"])
-    if taken + of_model[0] == 0:
-        raise TrainingError(f"--warm-start {other}: none of its weights fits; expected a run of the same width")
+    taken = [
+        _take_over(trainer.critic, found["critic"]),
+        _take_over(trainer.sampler, found["average"]),
+    ]
+    trainer.average.load_state_dict(trainer.sampler.state_dict())
+    if not any("hidden." in name for name in taken[1]):
+        raise TrainingError("--warm-start: no layer of its sampler fits; expected a run of the same width")
     trainer.save()
-    return taken + of_model[0], left + of_model[1]
+    wanted = len(trainer.critic.state_dict()) + len(trainer.sampler.state_dict())
+    return sum(map(len, taken)), wanted - sum(map(len, taken))
 
 
-def _take_over(model: nn.Module, state: dict[str, Tensor]) -> tuple[int, int]:
-    """Copy what has the same name and shape. How many tensors did, and how many did not."""
+def _take_over(model: nn.Module, state: dict[str, Tensor]) -> set[str]:
+    """Copy what has the same name and shape. The names."""
     wanted = model.state_dict()
     fitting = {
         name: value for name, value in _renamed(state, wanted).items() if name in wanted and value.shape == wanted[name].shape
     }
     model.load_state_dict({**wanted, **fitting})
-    return len(fitting), len(wanted) - len(fitting)
+    return set(fitting)
 
 
 def _renamed(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> dict[str, Tensor]:

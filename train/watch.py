@@ -17,7 +17,7 @@ LIMIT = 30.0  # times its lowest that the running mean of a loss may be
 SPIKE = 300.0  # times the lowest mean that a single loss may be: a mean alone is slow to show that an explosion has begun
 PATIENCE = 100  # iterations beyond the limit in a row: it will not come back
 MEMORY = 10  # iterations, of the running means
-UNITS = {"L_style": 1e-3, "L_D": 1.0}  # added to the magnitudes: L_D crosses zero, and neither means much far below
+UNITS = {"L_style": 2e-2, "L_D": 1.0}  # added to the magnitudes: L_D crosses zero, and neither means much far below
 FLAT = 0.05  # of the exemplar's deviation: an average whose colours deviate less than that ignores its noise
 
 

@@ -29,10 +29,11 @@ from solidgrain.train.cuts import Sample
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
 from solidgrain.train.loop import train
-from solidgrain.train.run import Run, Source, create_run, open_run
-from solidgrain.train.sampler import make_sampler
+from solidgrain.train.run import Run, RunFolder, Source, create_run, open_run
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, flat_slice
+from solidgrain.train.space import Space
+from solidgrain.train.task import make_task
 from solidgrain.train.vgg import find_weights
 
 SITTING = 5.0  # minutes of training between checkpoints
@@ -68,14 +69,19 @@ def prepare(arguments: argparse.Namespace, **asked: Any) -> tuple[torch.device, 
     torch.set_num_threads(arguments.threads or usable_threads())
     plan = {**{name: getattr(arguments, name) for name in ("minutes", "iterations", "slices", "device")}, **asked}
     plan["sifid"] = inception is not None
-    found = kept(arguments.out / PLAN)
-    if found is not None and not arguments.resume:
-        raise UsageError(f"--out {arguments.out}: holds results already; go on with --resume, or choose another folder")
+    settle(arguments.out, plan, arguments.resume)
+    return torch.device(arguments.device), inception
+
+
+def settle(out: Path, plan: dict[str, Any], resume: bool) -> None:
+    """Write the plan of a new comparison, or compare it with that of the one that goes on."""
+    found = kept(out / PLAN)
+    if found is not None and not resume:
+        raise UsageError(f"--out {out}: holds results already; go on with --resume, or choose another folder")
     if found is not None and found != plan:
         other = sorted(name for name in {*plan, *found} if plan.get(name) != found.get(name))
-        raise UsageError(f"--resume {arguments.out}: was started with other {', '.join(other)}; choose another --out")
-    keep(arguments.out / PLAN, plan)
-    return torch.device(arguments.device), inception
+        raise UsageError(f"--resume {out}: was started with other {', '.join(other)}; choose another --out")
+    keep(out / PLAN, plan)
 
 
 def kept(path: Path) -> dict[str, Any] | None:
@@ -139,17 +145,19 @@ def _spent(run: Run) -> tuple[int, float]:
     return (0, 0.0) if state is None else (state["iteration"], state["seconds"] / 60)
 
 
-def sampling(run: Run, device: torch.device) -> Sample:
-    """The run's averaged sampler as a function of points in exemplar pixels and a seed, with the runtime's noise.
+def sampling(run: RunFolder, device: torch.device, *conditions: Tensor) -> Sample:
+    """The run's averaged model as a function of points in exemplar pixels and a seed, with the runtime's noise.
 
-    In torch, since bundles cannot hold every variant. Points are moved to the origin first, where float32 coordinates are
-    exact enough: a texture is the same everywhere.
+    `conditions` are what a model needs besides points and noise: for a space the patch [1, 3, 128, 128]. In torch, since
+    bundles cannot hold every variant. Points are moved to the origin first, where float32 coordinates are exact enough: a
+    texture is the same everywhere.
     """
     state = run.load_checkpoint()
     if state is None:
         raise TrainingError(f"{run.folder}: no checkpoint to measure")
-    sampler = make_sampler(run.settings, torch.Generator(device))
-    sampler.load_state_dict(state["average"])
+    model = make_task(run, device).make_model(torch.Generator(device))
+    model.load_state_dict(state["average"])
+    octaves = model.sampler if isinstance(model, Space) else model
     instance: dict[int, Tensor] = {}
 
     @torch.no_grad()
@@ -157,9 +165,9 @@ def sampling(run: Run, device: torch.device) -> Sample:
         if seed not in instance:
             instance.clear()
             instance[seed] = torch.from_numpy(noise_tables(seed, run.settings.octaves)).to(device)
-            sampler.offsets = torch.from_numpy(noise_offsets(seed, run.settings.octaves)).float().to(device)
+            octaves.offsets = torch.from_numpy(noise_offsets(seed, run.settings.octaves)).float().to(device)
         near = torch.from_numpy((points - points.mean(0)) / UNIT).float().to(device)
-        rgb = torch.cat([sampler(instance[seed], chunk[None])[0] for chunk in torch.split(near, CHUNK)])
+        rgb = torch.cat([model(instance[seed], chunk[None], *conditions)[0] for chunk in torch.split(near, CHUNK)])
         found: FloatArray = rgb.clamp(0, 1).cpu().numpy()
         return found
 

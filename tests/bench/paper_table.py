@@ -22,8 +22,9 @@ import torch
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.files import replacing
 from solidgrain.train.command import with_grain
-from solidgrain.train.exemplar import FloatArray, read_exemplar
+from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
+from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import evaluate
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings
 from solidgrain.train.slices import from_quaternions, upright

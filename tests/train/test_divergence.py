@@ -11,9 +11,11 @@ import torch
 from solidgrain.runtime import TrainingError
 from solidgrain.train import critic, loop, watch
 from solidgrain.train.loop import Trainer, train
+from solidgrain.train.noise import draw_tables
 from solidgrain.train.run import open_run
 from solidgrain.train.sampler import Sampler
-from solidgrain.train.settings import Budget, preset
+from solidgrain.train.settings import PRESETS, Budget, preset
+from solidgrain.train.space import Space
 from solidgrain.train.watch import LIMIT, MEMORY, PATIENCE, Watch, flaw
 from tests.train.test_training import CPU, assert_same_checkpoint, losses, new_run
 
@@ -231,9 +233,22 @@ def test_a_slow_explosion_is_noticed_too():
     assert any(verdicts(styles))
 
 
-def test_fresh_networks_have_no_flaw_whatever_the_preset():
-    exemplar = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0))
-    for name in ("fast", "paper"):
-        settings = preset(name)
-        sampler = Sampler(settings, torch.Generator().manual_seed(1))
-        assert flaw([sampler], sampler, settings, exemplar) == ""
+@torch.no_grad()
+@pytest.mark.parametrize("name", PRESETS)
+def test_fresh_networks_have_no_flaw_whatever_the_preset(name):
+    draw = torch.Generator().manual_seed(0)
+    settings = preset(name)
+    tables, points = draw_tables(settings.octaves, 64, draw), 64 * torch.rand(2, 500, 3, generator=draw)
+    exemplars = [torch.rand(3, 128, 128, generator=draw) for _ in range(2)]
+    model = Space(settings, draw) if settings.latent else Sampler(settings, draw)
+    colors = model(tables, points, torch.stack(exemplars)) if settings.latent else model(tables, points)
+    assert flaw([model], colors, exemplars) == ""
+
+
+def test_a_flaw_of_one_texture_in_many_is_not_one_of_the_space():
+    exemplars = [torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(k)) for k in range(4)]
+    colors = torch.stack([exemplar.flatten(1).T for exemplar in exemplars])
+    colors[0] = 0.5
+    assert flaw([], colors, exemplars) == ""
+    colors[:] = 0.5
+    assert flaw([], colors, exemplars).startswith("the average has collapsed")

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from solidgrain.runtime import ExemplarError
-from solidgrain.train.exemplar import draw_patches, measure_grain, nonstationarity, read_exemplar
+from solidgrain.train.exemplar import draw_patches, measure_grain, nonstationarity
+from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.settings import preset
 from tests.train.conftest import blotches
 

@@ -14,7 +14,7 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
-from solidgrain.train.exemplar import read_photograph
+from solidgrain.train.photograph import read_photograph
 
 BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 D50 = np.array([0.9642, 1.0, 0.8249])  # of ICC's connection space
@@ -290,7 +290,7 @@ def test_a_studios_space_is_converted_by_the_running_configuration_and_standard_
         header = {"type": OpenEXR.scanlineimage, "oiio:ColorSpace": name}
         OpenEXR.File(header, {"RGB": ones}).write(os.fspath(tmp_path / f"{name}.exr"))
     code = (
-        "import sys; from solidgrain.train.exemplar import read_photograph;"
+        "import sys; from solidgrain.train.photograph import read_photograph;"
         "[print(*read_photograph(path, 64).pixels[0, 0].round(3)) for path in sys.argv[1:]]"
     )
     command = [sys.executable, "-c", code, tmp_path / "house_wood.exr", tmp_path / "lin_ap1_scene.exr"]

@@ -13,6 +13,7 @@ from solidgrain.train.noise import look_up
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import FAST, PAPER, preset, rate
 from solidgrain.train.slices import about_axis, draw_rotations, draw_slices, flat_slice
+from solidgrain.train.space import Space
 from tests.reference import locate, noise
 
 
@@ -102,6 +103,36 @@ def test_style_loss_ignores_where_things_are():
     activations = torch.randn(2, 5, 8, 8, generator=generator())
     assert style_loss([activations], [activations.roll(3, -1)], groups=1).item() == pytest.approx(0, abs=1e-6)
     assert style_loss([activations], [activations * 1.5], groups=1).item() > 0.1
+
+
+def test_style_loss_compares_exemplar_by_exemplar():
+    """Which patch of its exemplar stands where changes nothing; a patch under another exemplar's name does."""
+    real, fake = torch.randn(2, 6, 5, 8, 8, generator=generator()) * torch.arange(1, 7)[:, None, None, None]
+    together = style_loss([real], [fake], groups=3)
+    inside, between = [1, 0, 2, 3, 5, 4], [2, 1, 0, 3, 4, 5]
+    torch.testing.assert_close(style_loss([real], [fake[inside]], groups=3), together)
+    torch.testing.assert_close(style_loss([real[inside]], [fake], groups=3), together)
+    assert style_loss([real], [fake[between]], groups=3) > 1.1 * together
+    torch.testing.assert_close(style_loss([real], [fake[between]], groups=1), style_loss([real], [fake], groups=1))
+    one_by_one = [style_loss([real[k : k + 2]], [fake[k : k + 2]], groups=1) for k in (0, 2, 4)]
+    torch.testing.assert_close(torch.stack(one_by_one).mean(), together)
+
+
+def test_gram_matrices_are_averaged_over_the_patches_of_one_exemplar_and_never_over_two():
+    assert preset("fast", batch=6).gram_groups == 1
+    assert preset("fast space", batch=6, group=2).gram_groups == 3
+    assert preset("paper", batch=6).gram_groups == preset("paper space", batch=6).gram_groups == 6
+
+
+def test_what_the_latent_code_says_of_a_texture_is_float32_where_other_layers_are_not():
+    """An octave's T_i in bfloat16 would be off by whole texels."""
+    space = Space(preset("fast space", octaves=8), generator())
+    z = torch.randn(3, 32, generator=generator())
+    exact = space.condition(z)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert space.sampler.output(torch.ones(2, 128)).dtype == torch.bfloat16
+        found = space.condition(z)
+    assert all(torch.equal(a, b) and a.dtype == torch.float32 for a, b in zip(exact, found, strict=True))
 
 
 @pytest.mark.parametrize("rotations", ["uniform", "euler"])

@@ -16,8 +16,8 @@ import torch
 
 from solidgrain.export.from_run import check_agreement, export_run, sampler_weights
 from solidgrain.runtime import BundleError, TrainingError, load
-from solidgrain.train.exemplar import read_exemplar
 from solidgrain.train.loop import train
+from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import Budget, preset

@@ -13,9 +13,9 @@ from solidgrain.runtime import SolidgrainError, TrainingError
 from solidgrain.train import preview
 from solidgrain.train import vgg as vgg_module
 from solidgrain.train.critic import Critic
-from solidgrain.train.exemplar import read_exemplar
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.losses import make_judge, style_loss
+from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, open_run
 from solidgrain.train.sampler import NoiseAtInputSampler, Sampler, make_sampler
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings, from_json, preset, to_json

@@ -1,0 +1,144 @@
+"""A training may begin with what another has learned: all of its weights that fit, and nothing else of it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from solidgrain.runtime import TrainingError
+from solidgrain.train import critic, loop, settings
+from solidgrain.train.loop import Trainer, train
+from solidgrain.train.run import open_run
+from solidgrain.train.settings import Budget, preset
+from solidgrain.train.space_run import open_space_run
+from solidgrain.train.warm_start import learned, warm_start
+from tests.train.spaces import TINY_SPACE, new_space, photographs
+from tests.train.test_training import CPU, new_run
+
+SAME_WIDTH = {name: TINY_SPACE[name] for name in ("width", "resolution", "batch")}
+FLAGS = ["--iterations", 1, "--threads", 1, "--quiet"]
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """No pictures, a critic of three layers, presets of toys: what is tested here does not depend on them."""
+    torch.set_num_threads(1)
+    monkeypatch.setattr(loop, "_write_sample", lambda trainer: None)
+    monkeypatch.setattr(critic, "CONVOLUTIONS", ((3, 16, 3, True), (16, 32, 3, True), (32, 256, 3, True)))
+    tiny = {"fast": preset("fast", patch=32, **SAME_WIDTH), "fast space": preset("fast space", **TINY_SPACE)}
+    monkeypatch.setattr(settings, "PRESETS", settings.PRESETS | tiny)
+
+
+@pytest.fixture
+def single(tmp_path, photograph):
+    """A run of a single exemplar with twice the octaves of a tiny space."""
+    run = new_run(tmp_path / "single", photograph, octaves=8, **SAME_WIDTH)
+    train(run, Budget(iterations=2), CPU)
+    return run
+
+
+@pytest.fixture
+def space(tmp_path):
+    run = new_space(tmp_path / "space", members=3)
+    train(run, Budget(iterations=2), CPU)
+    return run
+
+
+def taken_over(run, other):
+    """Names of the new run's tensors that are the other's, and of those that are not."""
+    state, found = run.load_checkpoint(), other.load_checkpoint()
+    assert all(torch.equal(state["critic"][name], found["critic"][name]) for name in found["critic"])
+    assert [name for name, value in state["average"].items() if not torch.equal(value, state["sampler"][name])] == []
+    theirs = {name.removeprefix("sampler."): value for name, value in found["average"].items()}
+    same = {
+        name
+        for name, value in state["average"].items()
+        if torch.equal(value, theirs.get(name.removeprefix("sampler."), torch.tensor([])))
+    }
+    return same, set(state["average"]) - same
+
+
+def test_a_space_begins_with_a_single_exemplar_s_critic_and_the_layers_of_its_sampler(tmp_path, single):
+    run = new_space(tmp_path / "run")
+    fresh = Trainer(run, CPU).sampler.state_dict()
+    taken, left = warm_start(run, learned(single.folder), CPU)
+    same, different = taken_over(run, single)
+    layers = {f"sampler.hidden.{layer}.{part}" for layer in range(5) for part in ("weight", "bias")}
+    assert same == layers | {"sampler.constant", "sampler.output.weight", "sampler.output.bias"}
+    state = run.load_checkpoint()
+    assert all(torch.equal(state["average"][name], fresh[name]) for name in different)
+    assert taken == len(same) + len(state["critic"])
+    assert left == len(different)
+
+
+def test_a_space_begins_with_all_of_another_space(tmp_path, space):
+    run = new_space(tmp_path / "run", members=2)
+    _, left = warm_start(run, learned(space.folder), CPU)
+    assert taken_over(run, space)[1] == set()
+    assert left == 0
+
+
+def test_a_single_exemplar_begins_with_a_space_s_sampler_as_far_as_it_fits(tmp_path, space, photograph):
+    run = new_run(tmp_path / "run", photograph, octaves=8, **SAME_WIDTH)
+    warm_start(run, learned(space.folder), CPU)
+    assert taken_over(run, space)[1] == {"directions", "noise_weights", "octave_scale"}
+
+
+def test_a_single_exemplar_begins_with_all_of_another_and_its_octaves_as_they_became(tmp_path, single, photograph):
+    """Scale and direction of an octave go together: another spread in the settings must not tear them apart."""
+    run = new_run(tmp_path / "run", photograph, octaves=8, octave_span=3.0, **SAME_WIDTH)
+    warm_start(run, learned(single.folder), CPU)
+    assert taken_over(run, single)[1] == set()
+
+
+def test_a_warm_start_is_a_start_all_the_same(tmp_path, single):
+    """Iteration 0, no moments, no memory of losses; and the first step goes on from what was taken."""
+    run = new_space(tmp_path / "run")
+    warm_start(run, learned(single.folder), CPU)
+    state = run.load_checkpoint()
+    assert (state["iteration"], state["seconds"], state["setbacks"]) == (0, 0.0, 0)
+    assert state["sampler_optimiser"]["state"] == {}
+    assert state["watch"]["seen"] == 0
+    assert train(run, Budget(iterations=1), CPU).iteration == 1
+    after = run.load_checkpoint()["critic"]["logit.weight"]
+    assert 0 < (after - state["critic"]["logit.weight"]).abs().max() < 3 * run.settings.critic_rate
+
+
+def test_a_run_of_another_width_is_refused(tmp_path, single):
+    with pytest.raises(TrainingError, match="no layer of its sampler fits; expected a run of the same width"):
+        warm_start(new_space(tmp_path / "run", width=32), learned(single.folder), CPU)
+
+
+def test_the_command_line_says_how_much_it_took_over(solidgrain, tmp_path, single, space, photograph):
+    stones = photographs(tmp_path / "stones", 2)
+    for name, source, what in (("a", single, ["--space", stones]), ("c", single, [photograph]), ("d", space, [photograph])):
+        outcome = solidgrain("train", *what, "--out", tmp_path / name, "--warm-start", source.folder, *FLAGS)
+        assert outcome.code == 0, outcome.err
+        assert f"{source.folder}: took over " in outcome.err
+    tensors = len(space.load_checkpoint()["average"]) + len(space.load_checkpoint()["critic"])
+    outcome = solidgrain("train", "--space", stones, "--out", tmp_path / "e", "--warm-start", space.folder, *FLAGS)
+    assert f"took over {tensors} of {tensors} parameter tensors" in outcome.err
+    assert open_space_run(tmp_path / "e").load_checkpoint()["iteration"] == 1
+    assert open_run(tmp_path / "c").load_checkpoint()["iteration"] == 1
+
+
+@pytest.mark.parametrize("what", ["no run", "no checkpoint", "a damaged checkpoint", "another width", "itself"])
+def test_a_failed_warm_start_is_one_line_and_leaves_no_run_behind(solidgrain, tmp_path, single, what):
+    other, message = single.folder, "no layer of its sampler fits"
+    if what == "no run":
+        other, message = tmp_path / "nothing", f"{tmp_path / 'nothing'}: not a run directory"
+    elif what == "no checkpoint":
+        (other / "checkpoint.pt").unlink()
+        message = f"--warm-start {other}: no checkpoint yet"
+    elif what == "a damaged checkpoint":
+        (other / "checkpoint.pt").write_bytes(b"hello")
+        message = "damaged checkpoint"
+    else:
+        settings.PRESETS["fast space"] = preset("fast space", width=32)
+    out = other if what == "itself" else tmp_path / "run"
+    before = {path: path.stat().st_mtime_ns for path in single.folder.rglob("*")}
+    outcome = solidgrain("train", "--space", photographs(tmp_path / "stones", 2), "--out", out, "--warm-start", other, *FLAGS)
+    assert outcome.code == 1
+    assert ("already holds a run" if what == "itself" else message) in outcome.error
+    assert not (tmp_path / "run").exists()
+    assert {path: path.stat().st_mtime_ns for path in single.folder.rglob("*")} == before

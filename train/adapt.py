@@ -1,0 +1,323 @@
+"""Adapting a texture of a space to a photograph that the space was not trained on (Sec. 3.3).
+
+From what E and Q predict of the photograph, L_style alone is minimised over theta = (T_i, gamma_l, delta_l, A_l), all that
+this texture owns, on random slices of fresh noise. D and what S shares with the space's other textures are fixed. Departures
+from the paper, and what they gain, are in docs/training.md.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from solidgrain.runtime.bundle import SAMPLER, Bundle
+from solidgrain.runtime.errors import BundleError, TrainingError
+from solidgrain.runtime.fold import read_weights
+from solidgrain.runtime.texture_file import TextureData
+from solidgrain.train.collection import LEVELS, Member, draw_patches, wraps
+from solidgrain.train.companion import Companion
+from solidgrain.train.layers import activate
+from solidgrain.train.loop import use_bfloat16
+from solidgrain.train.losses import gram_matrices
+from solidgrain.train.noise import draw_tables, look_up
+from solidgrain.train.settings import Budget, Settings
+from solidgrain.train.slices import UNIT, draw_slices
+from solidgrain.train.vgg import STYLE_LAYERS, Vgg
+
+FloatArray = npt.NDArray[np.float32]
+
+ITERATIONS = 300
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How theta is moved. Rates are Adam's, at the start."""
+
+    octave_rate: float = 1e-2  # of T_i, relative to its size
+    style_rate: float = 1e-2  # of gamma_l and delta_l
+    noise_rate: float = 1e-2  # of A_l
+    warm_up: int = 10  # iterations until rates are whole: Adam's first steps are as long as its others, in no sure direction
+    constant: float = 2 / 3  # share of the budget after which rates begin to fall, to a tenth
+    average_decay: float = 0.95  # of the moving average that becomes the texture
+    tables_kept: int = 8  # iterations that share noise tables, each with offsets of its own
+    crops: int = 128  # of the photograph, whose mean Gram matrices are aimed at
+    measured: int = 8  # batches, of L_style as it is reported
+    memory: int = 30  # iterations, of the running mean of L_style
+    patience: int = 100  # iterations without a new low of that mean: a plateau
+    gain: float = 0.01  # by which a low must undercut the last one
+    limit: float = 10.0  # times its first value that the mean may reach
+
+
+DEFAULT = Recipe()
+
+
+@dataclass(frozen=True)
+class Report:
+    """How far an adaptation has come."""
+
+    iteration: int
+    seconds: float
+    style: float  # running mean of L_style
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """What came of it."""
+
+    texture: TextureData
+    start: float  # L_style of what E and Q predicted
+    end: float  # of the texture, on the same slices
+    iterations: int
+    seconds: float
+    ended: str  # why: "budget", "plateau", "stopped" or "diverged"
+
+
+class Features(NamedTuple):
+    """F of L_style."""
+
+    activations: Callable[[Tensor], Sequence[Tensor]]  # images [B, 3, H, W] -> [B, C, h, w] of each layer
+    relative: bool  # whether each layer's term is divided by the mean absolute entry of the photograph's Gram matrix
+
+
+class Theta(NamedTuple):
+    """What one texture owns."""
+
+    directions: Tensor  # [n, 3, 3], T_i over its size at the start, so that one rate suits all octaves
+    gamma: Tensor  # [hidden layers, m]
+    delta: Tensor  # [hidden layers, m]
+    noise_weights: Tensor  # A [4, n/4, m]
+
+    def copy(self) -> Theta:
+        return Theta(*(part.detach().clone() for part in self))
+
+
+class FrozenSampler:
+    """S with the weights that all textures of a bundle share; what a texture owns is an argument."""
+
+    def __init__(self, bundle: Bundle, texture: TextureData, device: torch.device) -> None:
+        try:
+            weights = read_weights((bundle.folder / SAMPLER).read_bytes(), texture)
+        except ValueError as error:
+            raise BundleError(f"{bundle.folder / SAMPLER}: cannot be adapted to: {error}") from error
+        self.first, *rest = (torch.tensor(weight, device=device) for weight in weights)  # b_0 + W_0 constant
+        self.layers = list(zip(rest[::2], rest[1::2], strict=True))  # W_l [m, m] for x W, b_l [m]
+
+    def __call__(self, noise: Tensor, theta: Theta) -> Tensor:
+        """noise [B, P, n] -> colour [B, P, 3], not clipped: Eq. 5, gamma and delta folded into the layer that follows."""
+        bins = noise.chunk(len(theta.noise_weights), dim=-1)  # (B, P, n / 4) each
+        y = self.first + bins[0] @ theta.noise_weights[0]
+        for layer, (weight, bias) in enumerate(self.layers):
+            folded, shifted = theta.gamma[layer, :, None] * weight, theta.delta[layer] @ weight + bias
+            y = F.linear(activate(y), folded.T, shifted)  # W (gamma phi(y) + delta) + b
+            if layer + 1 < len(bins):
+                y = y + bins[layer + 1] @ theta.noise_weights[layer + 1]
+        return y
+
+
+def critic_features(companion: Companion, device: torch.device) -> Features:
+    """F of L_style as in the paper: the activations of the space's own D, compared as they were in its training."""
+    critic = companion.critic.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return Features(lambda images: critic(images)[1], companion.settings.relative_gram)
+
+
+def vgg_features(device: torch.device) -> Features:
+    """What the paper compares it with: activations of a pretrained VGG. Raises SolidgrainError without its weights."""
+    vgg = Vgg(device)
+
+    def activations(images: Tensor) -> list[Tensor]:
+        found = vgg.features(images, padding=1)
+        return [found[layer] for layer in STYLE_LAYERS]
+
+    return Features(activations, relative=True)
+
+
+class Adaptation:
+    """The state of an adaptation: theta, its moving average, the optimiser, one random stream. `adapt` drives it."""
+
+    def __init__(
+        self,
+        start: TextureData,
+        sampler: FrozenSampler,
+        photograph: FloatArray,
+        features: Features,
+        settings: Settings,
+        recipe: Recipe,
+        device: torch.device,
+    ) -> None:
+        self.start, self.sampler, self.features, self.recipe = start, sampler, features, recipe
+        self.settings = replace(settings, octaves=len(start.transforms))
+        self.reduced_precision = use_bfloat16(settings, device)
+        self.generator = torch.Generator(device).manual_seed(settings.seed)
+        self.sizes = np.linalg.norm(start.transforms, axis=(1, 2), keepdims=True) / math.sqrt(3)  # [n, 1, 1]
+        self.octave_scale = torch.tensor(self.sizes * UNIT, dtype=torch.float32, device=device)
+        owned = (start.transforms / self.sizes, start.gamma, start.delta, start.noise_weights)
+        self.theta = Theta(*(torch.tensor(part, dtype=torch.float32, device=device, requires_grad=True) for part in owned))
+        self.average, self.iteration = self.theta.copy(), 0
+        rates = (recipe.octave_rate, recipe.style_rate, recipe.style_rate, recipe.noise_rate)
+        groups = [{"params": [part], "lr": rate, "start": rate} for part, rate in zip(self.theta, rates, strict=True)]
+        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
+        self.target = self._mean_grams(photograph)
+        self.tables = torch.empty(0)
+
+    def step(self, pace: float) -> float:
+        """One iteration at so much of the rates. L_style before it."""
+        if self.iteration % self.recipe.tables_kept == 0:
+            self.tables = draw_tables(self.settings.octaves, self.settings.resolution, self.generator)
+        loss = self._style(self.theta, self.tables, self.generator)
+        self.optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        pace *= min((self.iteration + 1) / self.recipe.warm_up, 1.0)
+        for group in self.optimiser.param_groups:
+            group["lr"] = pace * group["start"]
+        self.optimiser.step()
+        self._update_average()
+        self.iteration += 1
+        return float(loss.detach())
+
+    def _style(self, theta: Theta, tables: Tensor, generator: torch.Generator) -> Tensor:
+        """L_style of random slices."""
+        settings = self.settings
+        points = draw_slices(settings, generator)
+        offsets = settings.resolution * torch.rand(settings.octaves, 3, generator=generator, device=generator.device)
+        noise = look_up(tables, theta.directions * self.octave_scale, points, offsets)
+        with self._autocast():  # coordinates stay outside it: in bfloat16 they are wrong by texels
+            rgb = self.sampler(noise, theta)
+            images = rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
+            activations = self.features.activations(images)
+        terms = []
+        for wanted, of_layer in zip(self.target, activations, strict=True):
+            difference = (wanted - gram_matrices(of_layer, 1)).abs().mean()
+            terms.append(difference / wanted.abs().mean() if self.features.relative else difference)
+        return torch.stack(terms).mean()
+
+    @torch.no_grad()
+    def _mean_grams(self, photograph: FloatArray) -> list[Tensor]:
+        """What L_style compares with: since F is fixed, crops of the photograph need to be looked at only once."""
+        pixels = np.round(photograph * LEVELS).astype(np.uint16)
+        member = Member("", pixels, wraps(photograph))
+        batches = []
+        for _ in range(self.recipe.crops // self.settings.batch):
+            crops = draw_patches(member, self.settings.patch, self.settings.batch, self.settings, self.generator)
+            with self._autocast():
+                activations = self.features.activations(crops)
+            batches.append([gram_matrices(of_layer, 1) for of_layer in activations])
+        return [torch.stack(grams).mean(0) for grams in zip(*batches, strict=True)]
+
+    @torch.no_grad()
+    def measure(self, theta: Theta) -> float:
+        """L_style over many slices, the same ones whenever it is called."""
+        generator = torch.Generator(self.generator.device).manual_seed(self.settings.seed + 1)
+        tables = draw_tables(self.settings.octaves, self.settings.resolution, generator)
+        return float(torch.stack([self._style(theta, tables, generator) for _ in range(self.recipe.measured)]).mean())
+
+    def texture(self, theta: Theta) -> TextureData:
+        directions, gamma, delta, noise_weights = (part.detach().cpu().numpy() for part in theta)
+        transforms = directions.astype(np.float64) * self.sizes
+        return replace(self.start, transforms=transforms, gamma=gamma, delta=delta, noise_weights=noise_weights)
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        keep = min(self.recipe.average_decay, (1 + self.iteration) / (10 + self.iteration))
+        for average, current in zip(self.average, self.theta, strict=True):
+            average.lerp_(current, 1 - keep)
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.generator.device.type, torch.bfloat16, enabled=self.reduced_precision)
+
+
+@dataclass
+class Descent:
+    """The running mean of L_style, and theta's average when it was at its lowest."""
+
+    recipe: Recipe
+    best: Theta
+    mean: float = 0.0
+    first: float = math.nan  # value of it over a whole memory
+    lowest: float = math.inf
+    seen: int = 0
+    waited: int = 0  # iterations since the last low
+
+    def see(self, style: float, average: Theta) -> None:
+        self.seen, self.waited = self.seen + 1, self.waited + 1
+        self.mean += (style - self.mean) / min(self.seen, self.recipe.memory)
+        if self.seen == self.recipe.memory:
+            self.first = self.mean
+        if self.mean < (1 - self.recipe.gain) * self.lowest:
+            self.lowest, self.best, self.waited = self.mean, average.copy(), 0
+
+    @property
+    def diverged(self) -> bool:
+        return not math.isfinite(self.mean) or self.mean > self.recipe.limit * self.first
+
+    @property
+    def plateau(self) -> bool:
+        return self.waited >= self.recipe.patience
+
+
+@dataclass
+class Pace:
+    """So much of the rates: all of them at first, then falling to a tenth, from two thirds of the budget or a plateau on.
+
+    Falling takes half as long as it took to get there.
+    """
+
+    falls_from: float  # share of the budget
+
+    def at(self, share: float) -> float:
+        return 1 - 0.9 * min(max(share - self.falls_from, 0.0) / max(self.ends_at - self.falls_from, 1e-9), 1.0)
+
+    @property
+    def ends_at(self) -> float:
+        return min(1.5 * self.falls_from, 1.0)
+
+
+def adapt(
+    start: TextureData,
+    sampler: FrozenSampler,
+    photograph: FloatArray,
+    features: Features,
+    settings: Settings,
+    budget: Budget,
+    device: torch.device,
+    recipe: Recipe = DEFAULT,
+    on_report: Callable[[Report], None] = lambda report: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Adapted:
+    """Adapt a texture to a photograph [H, W, 3] until the budget is spent, L_style stops falling, or `should_stop` says so.
+
+    The texture is the moving average of theta, or, if that has the lower L_style, the average at the lowest running mean: so
+    an adaptation that diverges ends with the best that it had. It is never worse by L_style than `start`, which may be what
+    comes back. Raises TrainingError if L_style of that is not a number.
+    """
+    began = time.monotonic()
+    state = Adaptation(start, sampler, photograph, features, settings, recipe, device)
+    descent, pace, ended, share = Descent(recipe, state.average.copy()), Pace(recipe.constant), "budget", 0.0
+    unadapted = state.average.copy()
+    first = state.measure(unadapted)
+    if not math.isfinite(first):
+        raise TrainingError(f"texture {start.name!r}: its L_style is not a number; the critic or the bundle is damaged")
+    while share < pace.ends_at:
+        if should_stop():
+            ended = "stopped"
+            break
+        descent.see(state.step(pace.at(share)), state.average)
+        if descent.diverged:
+            ended = "diverged"
+            break
+        seconds = time.monotonic() - began
+        share = budget.progress(state.iteration, seconds)
+        if descent.plateau and share < pace.falls_from:
+            pace, ended = Pace(share), "plateau"
+        on_report(Report(state.iteration, seconds, descent.mean))
+    found = [(first, unadapted), *((state.measure(theta), theta) for theta in (descent.best, state.average))]
+    end, theta = min((pair for pair in found if math.isfinite(pair[0])), key=lambda pair: pair[0])
+    return Adapted(state.texture(theta), first, end, state.iteration, time.monotonic() - began, ended)

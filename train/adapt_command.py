@@ -1,0 +1,175 @@
+"""`solidgrain adapt`: a texture of a space, fitted to one photograph."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from solidgrain.bake.arguments import parse_count, parse_positive, parse_seconds, parse_seed
+from solidgrain.bake.flags import add_cut
+from solidgrain.runtime.errors import UsageError
+from solidgrain.runtime.space import DEFAULT_SPACE
+from solidgrain.train.command import INTERRUPTED, StopRequest, choose_device
+
+if TYPE_CHECKING:
+    import torch
+
+    from solidgrain.runtime.space import Space
+    from solidgrain.runtime.texture_file import TextureData
+    from solidgrain.train.adapt import Adapted, Features, Report
+    from solidgrain.train.photograph import FloatArray
+    from solidgrain.train.settings import Budget, Settings
+
+WHY = {
+    "budget": "all that it may",
+    "plateau": "L_style no longer falls",
+    "stopped": "stopped, what there is is saved",
+    "diverged": "L_style diverged",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("photo", type=Path, metavar="PHOTO", help="a photograph (PNG, JPEG, TIFF, EXR, ...)")
+    add("--out", type=Path, required=True, metavar="FILE", help="the texture file to write, .sgt.npz")
+    add("--bundle", default=DEFAULT_SPACE, metavar="SPACE", help=f"embedded name or bundle of the space ({DEFAULT_SPACE})")
+    add("--critic", type=Path, metavar="FILE", help="the space's critic, from export --companion (critic.npz in the bundle)")
+    add("--features", choices=("critic", "vgg"), default="critic", help="what compares slices with the photograph (critic)")
+    add("--iterations", type=parse_positive, metavar="N", help="at most (300, or as many as --seconds allow)")
+    add("--seconds", type=parse_seconds, metavar="S", help="at most; the result then depends on the machine's speed")
+    add_cut(parser.add_argument_group("the photograph"))
+    add("--seed", type=parse_seed, default=0, metavar="N", help="of all randomness (0)")
+    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute (auto)")
+    add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
+    add("--overwrite", action="store_true", help="replace the file if it exists")
+    add("--json", action="store_true", help="print one JSON object on stdout")
+    add("--quiet", action="store_true", help="no progress on stderr")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    import torch
+
+    from solidgrain.bake.sources import check_new
+    from solidgrain.runtime import load_space
+    from solidgrain.runtime.provider import usable_threads
+    from solidgrain.train.adapt import FrozenSampler, adapt
+
+    check_flags(arguments)
+    check_new(arguments.out, arguments.overwrite)
+    device = choose_device(arguments.device)
+    threads = arguments.threads or usable_threads()
+    torch.set_num_threads(threads)
+    space = load_space(arguments.bundle, threads=threads)
+    features, settings = open_features(space, arguments, device)
+    start, material = read_photo(space, arguments)
+    sampler = FrozenSampler(space.bundle, start, device)
+    budget = make_budget(arguments)
+    stop, progress = StopRequest(arguments.quiet), Progress(budget, arguments.quiet)
+    found = adapt(
+        start, sampler, material, features, settings, budget, device, on_report=progress.show, should_stop=stop.requested
+    )
+    progress.end()
+    if found.iterations == 0:
+        print(f"stopped before the first iteration; {arguments.out} is not written", file=sys.stderr)
+        return INTERRUPTED
+    space.open(found.texture).save(arguments.out)
+    say(found, space, arguments)
+    return INTERRUPTED if found.ended == "stopped" else 0
+
+
+def check_flags(arguments: argparse.Namespace) -> None:
+    if arguments.features == "vgg" and arguments.critic:
+        raise UsageError("--features vgg: compares without a critic; leave --critic out")
+    if arguments.out.exists() and arguments.photo.exists() and arguments.out.samefile(arguments.photo):
+        raise UsageError(f"--out {arguments.out}: is the photograph itself; choose another name")
+
+
+def make_budget(arguments: argparse.Namespace) -> Budget:
+    from solidgrain.train.adapt import ITERATIONS
+    from solidgrain.train.settings import Budget
+
+    if arguments.seconds is None:
+        return Budget(arguments.iterations or ITERATIONS)
+    return Budget(arguments.iterations, arguments.seconds / 60)
+
+
+def open_features(space: Space, arguments: argparse.Namespace, device: torch.device) -> tuple[Features, Settings]:
+    """What compares slices with the photograph, and the settings of both. Raises BundleError without a critic that fits."""
+    from solidgrain.train.adapt import critic_features, vgg_features
+    from solidgrain.train.companion import find_companion, read_companion, seen_settings
+
+    if arguments.features == "vgg":
+        features, settings = vgg_features(device), seen_settings(space.bundle.manifest["training"].get("settings"))
+    else:
+        companion = read_companion(find_companion(space.bundle, arguments.critic), space.bundle)
+        features, settings = critic_features(companion, device), companion.settings
+    return features, replace(settings, seed=arguments.seed)
+
+
+def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData, FloatArray]:
+    """What E and Q make of the photograph, and the pixels to adapt to: all of it, or with --crop what E sees."""
+    from solidgrain.bake.sources import Cut, cut_patch, scaled
+    from solidgrain.train.photograph import read_photograph
+
+    photograph = read_photograph(arguments.photo, 1)
+    if photograph.warning:
+        print(f"warning: {arguments.photo}: {photograph.warning}", file=sys.stderr)
+    cut = Cut(arguments.patch_scale, arguments.crop)
+    patch, note = cut_patch(photograph.pixels, space.patch, cut, str(arguments.photo))
+    print(note, file=sys.stderr)
+    start = space.own(space.encode(patch, arguments.photo.stem))
+    return start, patch if cut.corner else scaled(photograph.pixels, cut.scale or 1.0)
+
+
+def say(found: Adapted, space: Space, arguments: argparse.Namespace) -> None:
+    """What came of it."""
+    from solidgrain.runtime.bundle import find_bundle
+
+    report = {
+        "texture": str(arguments.out),
+        "name": found.texture.name,
+        "space": space.name,
+        "sampler_sha256": found.texture.sampler_sha256,
+        "texture_sha256": found.texture.sha256,
+        "features": arguments.features,
+        "style_start": found.start,
+        "style_end": found.end,
+        "iterations": found.iterations,
+        "seconds": round(found.seconds, 1),
+        "ended": found.ended,
+    }
+    if arguments.json:
+        print(json.dumps(report, indent=2))
+    if found.ended == "diverged":
+        print(f"warning: L_style diverged at iteration {found.iterations}; the best before that is kept", file=sys.stderr)
+    if found.end >= found.start:
+        print("warning: L_style has not fallen; the texture is the one that the encoder gives", file=sys.stderr)
+    spent = f"{found.iterations} iterations, {found.seconds:.0f} s"
+    print(f"L_style {found.start:.4f} -> {found.end:.4f}, {spent} ({WHY[found.ended]})", file=sys.stderr)
+    bundle = "" if find_bundle(found.texture.sampler_sha256, arguments.out.parent) else f" --bundle {arguments.bundle}"
+    print(f"{arguments.out}: next: solidgrain bake {arguments.out}{bundle} --size 128 --out out.vti", file=sys.stderr)
+
+
+class Progress:
+    """One line that rewrites itself on a terminal, a line every half minute in a log."""
+
+    def __init__(self, budget: Budget, quiet: bool) -> None:
+        self.budget, self.quiet, self.terminal = budget, quiet, sys.stderr.isatty()
+        self.printed = 0.0
+
+    def show(self, report: Report) -> None:
+        if self.quiet or (not self.terminal and report.seconds - self.printed < 30):
+            return
+        self.printed = report.seconds
+        done = self.budget.progress(report.iteration, report.seconds)
+        left = report.seconds * max(1 - done, 0) / done
+        line = f"iteration {report.iteration}, at most {left:.0f} s left, L_style {report.style:.4f}"
+        print(f"\r{line}  " if self.terminal else line, end="" if self.terminal else "\n", file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        if self.terminal and not self.quiet:
+            print(file=sys.stderr)
