@@ -84,7 +84,8 @@ def build_mapping_graph(weights: MappingWeights) -> onnx.ModelProto:
     styles = [op.gemm(w, op.const(weight), op.const(bias)) for weight, bias in weights.affine]
     halves = [op.split(style, op.const([width, width]), outputs_count=2, axis=1) for style in styles]
     if weights.output is not None:
-        halves[-1] = _with_colors(z, *halves[-1], *weights.output)
+        last_gamma, last_delta = halves[-1]
+        halves[-1] = _with_colors(z, last_gamma, last_delta, *weights.output)
     gamma, delta = (op.concat([op.unsqueeze(half[k], op.const([1])) for half in halves], axis=1) for k in (0, 1))
     count = op.concat([op.shape(z, start=0, end=1), op.const([1, 1, 1])], axis=0)
     noise_weights = op.expand(op.const(weights.noise_weights[None]), count)
@@ -92,7 +93,7 @@ def build_mapping_graph(weights: MappingWeights) -> onnx.ModelProto:
 
 
 def _with_colors(z: Var, gamma: Var, delta: Var, weight: FloatArray, bias: FloatArray) -> tuple[Var, Var]:
-    """The last layer's style, such that colours become mean + contrast * rgb: `solidgrain.train.space.Space`, `_with_colors`."""
+    """The last layer's style, such that colours become mean + contrast * rgb (`_with_colors` of `solidgrain.train.space`)."""
     mean = op.slice(z, op.const([-4]), op.const([-1]), op.const([1]))
     contrast = op.slice(z, op.const([-1]), op.const([np.iinfo(np.int64).max]), op.const([1]))
     exact = weight.astype(np.float64)

@@ -274,7 +274,8 @@ def train(
 
 def parameter_groups(model: nn.Module, settings: Settings) -> list[dict[str, Any]]:
     """The sampler's parameters with their shares of its learning rate: T_i and Q, which make streaks when rushed, apart."""
-    octaves, others = [], []
+    octaves: list[nn.Parameter] = []
+    others: list[nn.Parameter] = []
     for name, parameter in model.named_parameters():
         (octaves if "directions" in name or ".octaves." in name else others).append(parameter)
     return [{"params": others, "share": 1.0}, {"params": octaves, "share": settings.octave_rate}]

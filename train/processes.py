@@ -111,7 +111,7 @@ class Processes:
         try:
             yield
         except RuntimeError as error:
-            reason = f"another one has ended or does not answer ({_first_line(error)}); go on with --resume once all can"
+            reason = f"another one has ended or does not answer ({_first_sentence(error)}); go on with --resume once all can"
             raise LostProcessError(f"process {self.rank} of {self.count}: {reason}") from error
 
 
@@ -133,7 +133,7 @@ def joined(device: torch.device) -> Iterator[Processes]:
     try:
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=PATIENCE)
     except (RuntimeError, ValueError) as error:
-        reason = f"WORLD_SIZE is {count}, but the processes do not meet ({_first_line(error)}); start them with torchrun"
+        reason = f"WORLD_SIZE is {count}, but the processes do not meet ({_first_sentence(error)}); start them with torchrun"
         raise TrainingError(reason) from error
     try:
         yield Processes(dist.get_rank(), count)
@@ -152,5 +152,6 @@ def local_device(device: torch.device) -> torch.device:
     return torch.device(device.type, int(number)) if device.type == "cuda" and number else device
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+def _first_sentence(error: Exception) -> str:
+    """What torch says, without its advice."""
+    return str(error).strip().split("\n")[0].split(". ")[0] or type(error).__name__

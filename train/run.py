@@ -14,7 +14,7 @@ import io
 import json
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -67,17 +67,7 @@ class RunFolder:
     def load_checkpoint(self) -> dict[str, Any] | None:
         """The last complete checkpoint, or None before the first."""
         path = self.folder / CHECKPOINT
-        if not path.exists():
-            return None
-        try:
-            state: dict[str, Any] = torch.load(io.BytesIO(unpack(path.read_bytes())), map_location="cpu", weights_only=True)
-            if missing := CHECKPOINT_KEYS - state.keys():
-                raise KeyError(f"no {', '.join(sorted(missing))}")
-        except Exception as error:  # torch raises a dozen unrelated types for damaged files
-            raise TrainingError(
-                f"{path}: damaged checkpoint ({type(error).__name__}); start the run again elsewhere"
-            ) from error
-        return state
+        return read_checkpoint(path, CHECKPOINT_KEYS) if path.exists() else None
 
     def append_stats(self, line: dict[str, Any]) -> None:
         with self._written(STATS), open(self.folder / STATS, "a", encoding="utf-8") as file:
@@ -105,6 +95,17 @@ class RunFolder:
                 f"{self.folder / name}: cannot write ({error.strerror}); the last checkpoint is whole: "
                 f"make space and go on with --resume {self.folder}"
             ) from error
+
+
+def read_checkpoint(path: Path, wanted: Collection[str]) -> dict[str, Any]:
+    """A checkpoint file that holds what is wanted. Raises TrainingError if it does not, or is damaged."""
+    try:
+        state: dict[str, Any] = torch.load(io.BytesIO(unpack(path.read_bytes())), map_location="cpu", weights_only=True)
+        if missing := set(wanted) - state.keys():
+            raise KeyError(f"no {', '.join(sorted(missing))}")
+    except Exception as error:  # torch raises a dozen unrelated types for damaged files
+        raise TrainingError(f"{path}: damaged checkpoint ({type(error).__name__}); start the run again elsewhere") from error
+    return state
 
 
 @dataclass(frozen=True)

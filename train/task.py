@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from solidgrain.train import collection, exemplar
+from solidgrain.train.collection import Member
 from solidgrain.train.noise import draw_tables
 from solidgrain.train.run import Run, RunFolder
 from solidgrain.train.sampler import make_sampler
@@ -111,9 +112,16 @@ class TextureSpace:
 
     def shown(self) -> Sequence[tuple[Tensor, tuple[Tensor, ...]]]:
         generator = torch.Generator(self.device).manual_seed(7)
-        unseen = [member for member in self.run.members if member.name in self.run.held_out][: SHOWN // 2]
-        patches = [one.crop(self.settings.encoded_patch, generator) for one in (*self.members[: SHOWN - len(unseen)], *unseen)]
+        unseen = _spread([member for member in self.run.members if member.name in self.run.held_out], SHOWN // 2)
+        shown = [*_spread(self.members, SHOWN - len(unseen)), *unseen]
+        patches = [one.crop(self.settings.encoded_patch, generator) for one in shown]
         return [(patch, (patch[None],)) for patch in patches]
+
+
+def _spread(members: Sequence[Member], count: int) -> list[Member]:
+    """So many of them, or all, far apart in the order of their names: neighbours often show the same material."""
+    count = min(count, len(members))
+    return [members[k * len(members) // count] for k in range(count)]
 
 
 def draw_noise(settings: Settings, generator: torch.Generator) -> Tensor:

@@ -10,6 +10,7 @@ from solidgrain.runtime.bundle import CARD
 
 if TYPE_CHECKING:
     from solidgrain.runtime import Space, Texture
+    from solidgrain.runtime.blend_file import BlendData
 
 MANY = 3  # exemplars that are named
 
@@ -34,12 +35,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 def summary(loaded: Texture | Space, error: float, reproduced: bool) -> str:
     from solidgrain.runtime import Space
+    from solidgrain.runtime.blend_file import BlendData
 
     manifest: dict[str, Any] = loaded.bundle.manifest
     training = manifest["training"]
     verdict = "reproduced" if reproduced else "NOT REPRODUCED"
     lines = [
-        f"{'space' if loaded.bundle.is_space else 'texture':<11}{loaded.name}",
+        f"{'space' if isinstance(loaded, Space) else 'texture':<11}{loaded.name}",
         f"bundle     {loaded.bundle.folder}, format {manifest['format_version']}, {manifest['producer']}",
         f"sampler    {manifest['octaves']} octaves, {manifest['hidden_layers']} layers of {manifest['width']} units",
         f"colour     {manifest['color_encoding']}",
@@ -48,11 +50,23 @@ def summary(loaded: Texture | Space, error: float, reproduced: bool) -> str:
     if isinstance(loaded, Space):
         lines.insert(3, f"encoder    {loaded.patch}² pixels to {manifest['latent']} numbers")
     else:
+        if isinstance(loaded.data, BlendData):
+            lines.insert(1, f"blend      {_blend(loaded.data)}")
         lines.append(f"runs on    {loaded.provider}" + (f" ({loaded.provider_note})" if loaded.provider_note else ""))
     if training:
         minutes, exemplars = f"{training['minutes']:g} minutes", _exemplars(training.get("exemplars", []))
         lines.append(f"trained    {training['iterations']} iterations, {minutes}, on {exemplars}")
     return "\n".join(lines)
+
+
+def _blend(data: BlendData) -> str:
+    """From which texture to which, and where the mask lies."""
+    mask = data.mask
+    size = "x".join(str(count) for count in mask.count)
+    low, high = (
+        (*(round(start + k * length, 6) for start, length in zip(mask.origin, mask.extent, strict=True)),) for k in (0, 1)
+    )
+    return f"{data.names[0]} to {data.names[1]} by a mask of {size} voxels (x, y, z), from {low} to {high}"
 
 
 def _exemplars(entries: list[dict[str, Any]]) -> str:

@@ -120,6 +120,14 @@ def test_a_texture_along_an_axis_bakes_resumes_and_verifies(solidgrain, blend, t
     assert solidgrain("verify", out).code == 3
 
 
+def test_info_says_from_where_to_where_a_blend_goes(blend, solidgrain, folder, tmp_path):
+    blend("--along", "z", "--from", 4, "--to", 20, "--out", tmp_path / "ab.sgt.npz")
+    outcome = solidgrain("info", tmp_path / "ab.sgt.npz", "--bundle", folder)
+    assert outcome.code == 0
+    assert outcome.out.startswith("texture    a-b\n")
+    assert "a to b by a mask of 1x1x2 voxels (x, y, z), from (0.0, 0.0, -4.0) to (1.0, 1.0, 28.0)" in outcome.out
+
+
 def test_an_interrupted_bake_of_a_blend_goes_on_to_the_same_bytes(blend, solidgrain, folder, tmp_path):
     file = tmp_path / "ab.sgt.npz"
     blend("--along", "z", "--from", 10, "--to", 60, "--out", file)

@@ -16,19 +16,24 @@ import torch
 pytest.importorskip("stlpips_pytorch", reason="the measures need VGG-16: pip install 'solidgrain[evaluate]'")
 
 from solidgrain.export.bundle import Details, write_bundle
+from solidgrain.export.from_space_run import export_space_run
 from solidgrain.export.space_graphs import EncoderWeights
 from solidgrain.runtime import SolidgrainError, load_space
 from solidgrain.runtime.texture_file import read_texture
 from solidgrain.train.cuts import as_image
 from solidgrain.train.likelihood import BANDWIDTHS
+from solidgrain.train.loop import train
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import Measure
+from solidgrain.train.settings import Budget
 from tests.bench import cells, space_measure, space_table, space_values
 from tests.bench.signed_rank import signed_rank
 from tests.bench.space_measure import Reference, cut_crops
-from tests.bench.space_methods import Methods
+from tests.bench.space_methods import Methods, open_henzler
 from tests.small_space import LATENT, small_space_weights
 from tests.train.conftest import blotches
+from tests.train.spaces import new_space
+from tests.train.spaces import photographs as photographs_folder
 
 PATCH = 64
 HELD_OUT = ("granite.png", "marble.png")
@@ -285,3 +290,15 @@ def test_signed_ranks_of_darwin_s_maize_and_of_ties():
     tail = min(np.mean([one <= positive for one in sums]), np.mean([one >= positive for one in sums]))
     assert signed_rank(ties.tolist()) == pytest.approx(2 * tail)
     assert signed_rank([0.0, 0.0]) == signed_rank([1.0, -1.0]) == 1.0
+
+
+def test_a_run_is_sampled_in_torch_as_its_bundle_is_by_the_runtime(tmp_path):
+    run = new_space(tmp_path / "run", photographs_folder(tmp_path / "stones"))
+    train(run, Budget(iterations=1), torch.device("cpu"))
+    space = load_space(export_space_run(run.folder, tmp_path / "space"))
+    patch = read_exemplar(tmp_path / "stones" / "stone2.png", 128)[16:144, 16:144]
+    points = cells.plane(16, torch.eye(3), np.array([100.0, 200.0, 300.0]))
+    near = points - points.mean(0)  # where a run is sampled
+    of_run, of_bundle = open_henzler(run.folder, 1)(patch), space.encode(patch).sample
+    np.testing.assert_allclose(of_run(points, 3), of_bundle(near, 3), atol=5e-3)  # E is rounded to half precision
+    assert np.abs(of_run(points, 3) - of_run(points, 4)).max() > 0.02

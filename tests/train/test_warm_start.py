@@ -91,6 +91,17 @@ def test_a_single_exemplar_begins_with_all_of_another_and_its_octaves_as_they_be
     assert taken_over(run, single)[1] == set()
 
 
+def test_a_checkpoint_file_of_weights_alone_in_half_precision_will_do(tmp_path, space):
+    state = space.load_checkpoint()
+    weights = {part: {name: value.half() for name, value in state[part].items()} for part in ("critic", "average")}
+    torch.save(weights, tmp_path / "weights.pt")
+    run = new_space(tmp_path / "run", members=3)
+    warm_start(run, learned(tmp_path / "weights.pt"), CPU)
+    begun = run.load_checkpoint()
+    for part in ("critic", "average"):
+        assert all(torch.equal(value, weights[part][name].float()) for name, value in begun[part].items())
+
+
 def test_a_warm_start_is_a_start_all_the_same(tmp_path, single):
     """Iteration 0, no moments, no memory of losses; and the first step goes on from what was taken."""
     run = new_space(tmp_path / "run")
