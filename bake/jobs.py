@@ -137,9 +137,9 @@ def _flat(value: Any) -> Iterator[Any]:
 
 def _source(texture: str | None, folder: Path) -> str | None:
     """A texture by its embedded name, or by its path from the job file's folder."""
-    from solidgrain.runtime.bundle import embedded_names
+    from solidgrain.runtime.bundle import embedded_bundles
 
-    if texture is None or texture in embedded_names():
+    if texture is None or texture in embedded_bundles():
         return texture
     return os.fspath(folder / texture) if os.sep in texture or (folder / texture).exists() else texture
 

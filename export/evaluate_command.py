@@ -16,6 +16,7 @@ SHEETS = (".png", ".html")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("source", metavar="SOURCE", help="embedded name, bundle or texture file")
+    add("--bundle", metavar="FOLDER", help="the bundle of a texture file")
     add("--exemplar", type=Path, required=True, metavar="PHOTO", help="the photograph that it was trained on")
     add(
         "--slices", type=parse_positive, default=50, metavar="N", help="axis-aligned and oblique slices, one instance each (50)"
@@ -38,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.sheet:
         check_sheet(arguments.sheet, arguments.exemplar)
     inception = Inception(arguments.inception) if arguments.inception else None
-    texture = load_texture(arguments.source, threads=arguments.threads)
+    texture = load_texture(arguments.source, bundle=arguments.bundle, threads=arguments.threads)
     exemplar = read_exemplar(arguments.exemplar, SMALLEST)
     print(f"measuring {2 * arguments.slices} slices of {texture.name}", file=sys.stderr)
     found = measure(texture, exemplar, arguments.slices, inception)

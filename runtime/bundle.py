@@ -112,22 +112,27 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def embedded_bundles() -> list[str]:
+    """The names of the bundles that come with the package, textures and spaces."""
+    return sorted(folder.name for folder in _embedded_root().iterdir() if (folder / MANIFEST).is_file())
+
+
 def embedded_names() -> list[str]:
     """The names of the textures that come with the package."""
-    return sorted(folder.name for folder in _embedded_root().iterdir() if (folder / MANIFEST).is_file())
+    return [name for name in embedded_bundles() if (_embedded_root() / name / TEXTURE).is_file()]
 
 
 def bundle_folder(source: str) -> Path:
     """The folder of a bundle that is named by its path, or of an embedded one. Raises BundleError if there is none."""
     path = Path(source)
-    if path.is_dir() and ((path / MANIFEST).is_file() or source not in embedded_names()):
+    if path.is_dir() and ((path / MANIFEST).is_file() or source not in embedded_bundles()):
         return path
     return embedded_folder(source)
 
 
 def embedded_folder(name: str) -> Path:
     """The folder of an embedded bundle. Raises BundleError, with close names, when there is none of that name."""
-    names = embedded_names()
+    names = embedded_bundles()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
         hint = f"did you mean {' or '.join(close)}?" if close else f"embedded textures are {', '.join(names)}"
@@ -137,7 +142,7 @@ def embedded_folder(name: str) -> Path:
 
 def find_bundle(sampler_sha256: str, near: Path) -> Path | None:
     """The bundle that a texture file belongs to: the folder that it lies in, or an embedded one."""
-    for folder in (near, *(_embedded_root() / name for name in embedded_names())):
+    for folder in (near, *(_embedded_root() / name for name in embedded_bundles())):
         path = folder / SAMPLER
         if (folder / MANIFEST).is_file() and path.is_file() and file_sha256(path) == sampler_sha256:
             return folder

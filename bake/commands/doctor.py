@@ -93,12 +93,12 @@ def _providers(problems: list[str]) -> dict[str, str]:
 
 def _textures(problems: list[str]) -> dict[str, float]:
     """The embedded textures, with their largest difference from the colours in their manifests."""
-    from solidgrain.runtime import SolidgrainError, embedded_names
-    from solidgrain.runtime.bundle import embedded_folder, open_bundle
+    from solidgrain.runtime import SolidgrainError
+    from solidgrain.runtime.bundle import embedded_bundles, embedded_folder, open_bundle
     from solidgrain.runtime.probe import TOLERANCE, probe_error
 
     errors = {}
-    for name in embedded_names():
+    for name in embedded_bundles():
         try:
             errors[name] = probe_error(open_bundle(embedded_folder(name)))
         except SolidgrainError as error:

@@ -5,6 +5,8 @@ Each writes what it found to FOLDER/found.RANK.pt.
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -66,6 +68,19 @@ def trained(folder: Path, processes: Processes, *sittings: int):
     return {"weights": weights(trainer), "stream": trainer.generator.get_state(), "style": reports[-1].style}
 
 
+def interrupt_itself(after: int) -> None:
+    """Ctrl-C reaches this process alone, once a trainer has come to that iteration."""
+    step = Trainer.step
+
+    def interrupted(trainer):
+        report = step(trainer)
+        if trainer.iteration == after:
+            os.kill(os.getpid(), signal.SIGINT)
+        return report
+
+    Trainer.step = interrupted
+
+
 def failing_in(rank, processes):
     """What comes of a beginning that fails in one process."""
 
@@ -99,6 +114,9 @@ def main() -> None:
         }
         flags = ["--space", folder / "stones", "--out", folder / "run", "--warm-start", folder / "whole", "--hold-out", 1]
         found["exit code"] = cli.main(["train", *map(str, flags), "--iterations", "2", "--threads", "1", "--quiet"])
+        if not processes.first:
+            interrupt_itself(after=3)
+        found["interrupted"] = cli.main(["train", "--resume", str(folder / "run"), "--iterations", "1000", "--quiet"])
         torch.save(found, folder / f"found.{processes.rank}.pt")
 
 
