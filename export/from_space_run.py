@@ -33,6 +33,7 @@ from solidgrain.train.settings import to_json
 from solidgrain.train.slices import UNIT
 from solidgrain.train.space import Space
 from solidgrain.train.space_run import SpaceRun, open_space_run
+from solidgrain.train.task import make_task
 
 SEED = 1
 
@@ -48,7 +49,8 @@ def export_space_run(run_folder: Path, out: Path, name: str = "", overwrite: boo
     if companion and not run.settings.trains_critic:
         raise TrainingError(f"{run_folder}: --companion: a run with --variant {run.settings.variant} trains no critic")
     state = trained_state(run)
-    average = Space(run.settings, torch.Generator())
+    average = make_task(run, torch.device("cpu")).make_model(torch.Generator())  # which knows the exemplars' colours
+    assert isinstance(average, Space)
     try:
         average.load_state_dict(state["average"])
     except (RuntimeError, TypeError) as error:

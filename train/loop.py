@@ -135,7 +135,7 @@ class Trainer:
             group["lr"] = lowered * rate(s.critic_rate, s.critic_rate_floor, s.critic_half_life, self.iteration)
         for group in self.sampler_optimiser.param_groups:
             sampler_rate = rate(s.sampler_rate, s.sampler_rate_floor, s.sampler_half_life, self.iteration)
-            group["lr"] = lowered * group["share"] * sampler_rate
+            group["lr"] = lowered * group.get("share", 1.0) * sampler_rate
 
     @torch.no_grad()
     def _update_average(self) -> None:
@@ -274,6 +274,8 @@ def train(
 
 def parameter_groups(model: nn.Module, settings: Settings) -> list[dict[str, Any]]:
     """The sampler's parameters with their shares of its learning rate: T_i and Q, which make streaks when rushed, apart."""
+    if settings.octave_rate == 1:  # one group, as in the checkpoints of earlier versions
+        return [{"params": list(model.parameters())}]
     octaves: list[nn.Parameter] = []
     others: list[nn.Parameter] = []
     for name, parameter in model.named_parameters():

@@ -7,13 +7,14 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
 from solidgrain.runtime import SolidgrainError, Space, UsageError, load_space, load_texture
 from solidgrain.runtime.bundle import MANIFEST
+from solidgrain.runtime.texture_file import read_texture, write_texture
 from solidgrain.train.cuts import Sample, as_image
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.run import OPTIONS
@@ -37,7 +38,7 @@ class Methods:
 
     space: Space
     threads: int
-    seconds: float | None  # of adapting; None if there is none
+    budget: tuple[str, str] | None  # of adapting, as its command takes it; None if there is none
     critic: Path | None  # of adapting, where the bundle does not hold it
     henzler: SamplesOf | None
 
@@ -45,7 +46,7 @@ class Methods:
     def passes(self) -> list[list[str]]:
         """The columns, those first that take the least time."""
         first = ["truth", "unadapted"] if self.henzler is None else ["truth", "unadapted", "henzler"]
-        return [first] if self.seconds is None else [first, *([column] for column in ADAPTED)]
+        return [first] if self.budget is None else [first, *([column] for column in ADAPTED)]
 
     def sample(self, column: str, patch: FloatArray, folder: Path) -> Sample:
         """A column's texture of the patch that lies in the folder as `exemplar.png`, adapted unless it was before."""
@@ -68,7 +69,7 @@ class Methods:
         """
         part = out.with_name(f"{features}.part.sgt.npz")
         words = ["adapt", photograph, "--bundle", self.space.bundle.folder, "--out", part, "--overwrite", "--json", "--quiet"]
-        words += ["--seconds", f"{self.seconds:g}", "--features", features, "--threads", self.threads]
+        words += [*(self.budget or ()), "--features", features, "--threads", self.threads]
         words += ["--critic", self.critic] if self.critic and features == "critic" else []
         command = [sys.executable, "-m", "solidgrain.bake.cli", *map(str, words)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -76,7 +77,8 @@ class Methods:
             said = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
             raise SolidgrainError(f"{photograph}: adapting with {features} failed: {said}")
         cells.keep(out.with_name(f"{features}-adapted.json"), json.loads(done.stdout))
-        part.replace(out)
+        write_texture(out, replace(read_texture(part), name=out.parent.name))
+        part.unlink()
 
 
 def open_henzler(source: Path, threads: int) -> SamplesOf:

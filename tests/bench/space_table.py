@@ -166,8 +166,15 @@ def methods_of(space: Space, arguments: argparse.Namespace) -> Methods:
     if not arguments.only_unadapted:
         find_companion(space.bundle, arguments.critic)
     henzler = open_henzler(arguments.henzler, arguments.threads) if arguments.henzler else None
-    seconds = None if arguments.only_unadapted else arguments.seconds
-    return Methods(space, arguments.threads, seconds, arguments.critic, henzler)
+    budget = None if arguments.only_unadapted else budget_of(arguments)
+    return Methods(space, arguments.threads, budget, arguments.critic, henzler)
+
+
+def budget_of(arguments: argparse.Namespace) -> tuple[str, str]:
+    """How long to adapt, as `solidgrain adapt` takes it."""
+    if arguments.iterations:
+        return "--iterations", str(arguments.iterations)
+    return "--seconds", f"{arguments.seconds:g}"
 
 
 def settle(space: Space, arguments: argparse.Namespace) -> None:
@@ -181,7 +188,7 @@ def settle(space: Space, arguments: argparse.Namespace) -> None:
     if arguments.large:
         cells.settle(out / "large", {"patch-scale": arguments.patch_scale}, resume=True)
     if not arguments.only_unadapted:
-        cells.settle(out / "adapted", {"seconds": arguments.seconds}, resume=True)
+        cells.settle(out / "adapted", {"budget": " ".join(budget_of(arguments))}, resume=True)
     if arguments.henzler:
         cells.settle(out / "henzler", {"henzler": str(arguments.henzler.resolve())}, resume=True)
 

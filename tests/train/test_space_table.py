@@ -86,7 +86,7 @@ def adapted(monkeypatch):
     asked = []
 
     def adapt(self, photograph, out, features):
-        asked.append((photograph.parent.name, features, self.seconds))
+        asked.append((photograph.parent.name, features, self.budget))
         if photograph.parent.name == "wood.png" and features == "vgg":
             raise SolidgrainError(f"{photograph}: adapting failed")
         shutil.copy(out.with_name("unadapted.sgt.npz"), out)
@@ -107,15 +107,15 @@ def test_a_table_grows_by_what_is_asked_and_nothing_is_made_twice(flags, adapted
     assert cells.reported(lambda: space_table.main([*flags, "--seconds", "5", "--resume"])) == 1  # one could not be adapted
     err = capsys.readouterr().err
     assert "left out: " in err and "1 results are missing" in err
-    assert adapted == [(name, f, 5.0) for f in ("critic", "vgg") for name in (*HELD_OUT, "wood.png")]
+    assert adapted == [(name, f, ("--seconds", "5")) for f in ("critic", "vgg") for name in (*HELD_OUT, "wood.png")]
     assert (out / "held-out/granite.png/unadapted.json").stat().st_mtime_ns == first
     assert not (out / "far/wood.png/vgg.json").exists()
 
     adapted.clear()
     assert cells.reported(lambda: space_table.main([*flags, "--seconds", "5", "--resume"])) == 1
-    assert adapted == [("wood.png", "vgg", 5.0)]  # nothing else is tried again
-    assert cells.reported(lambda: space_table.main([*flags, "--seconds", "9", "--resume"])) == 2
-    assert "started with other seconds" in capsys.readouterr().err
+    assert adapted == [("wood.png", "vgg", ("--seconds", "5"))]  # nothing else is tried again
+    assert cells.reported(lambda: space_table.main([*flags, "--iterations", "9", "--resume"])) == 2
+    assert "started with other budget" in capsys.readouterr().err
 
     told = (out / "table.md").read_text()
     assert "| SIFID × 10⁵ (the paper, Table 2) | 2.46 ± 2.80 | 2.60 ± 2.85 | 2.47 ± 2.23 | – | – |" in told
@@ -184,7 +184,7 @@ def test_adapting_with_d_needs_it_before_anything_is_made(flags, tmp_path, capsy
 
 
 def test_a_failed_adapting_says_why(bundle, tmp_path):
-    methods = Methods(load_space(bundle), 1, 1.0, None, None)
+    methods = Methods(load_space(bundle), 1, ("--seconds", "1"), None, None)
     with pytest.raises(SolidgrainError, match=r"nothing\.png: adapting with critic failed: .+"):
         methods.adapt(tmp_path / "nothing.png", tmp_path / "a.sgt.npz", "critic")
 

@@ -133,6 +133,20 @@ def test_a_step_teaches_every_part_of_the_space(tmp_path):
     assert {name for name in before if torch.equal(before[name], after[name])} == {"sampler.octave_scale"}
 
 
+def test_octaves_and_what_makes_them_move_at_their_own_rate(tmp_path):
+    """Adam's first step is as long as its rate, whatever the gradient."""
+    trainer = Trainer(new_space(tmp_path / "run", photographs(tmp_path / "stones", 2), octave_rate=0.1), CPU)
+    before = {name: weight.detach().clone() for name, weight in trainer.sampler.named_parameters()}
+    trainer.step()
+    after = trainer.sampler.state_dict()
+    moved = {name: float((after[name] - weight).abs().max()) for name, weight in before.items()}
+    slow = {name for name in moved if name == "sampler.directions" or name.startswith("mapping.octaves.")}
+    assert len(slow) == 5
+    for name, distance in moved.items():
+        share = 0.1 if name in slow else 1.0
+        assert distance == pytest.approx(share * trainer.settings.sampler_rate, rel=0.01), name
+
+
 def test_what_was_held_out_and_what_tiles_is_recorded(tmp_path):
     folder = photographs(tmp_path / "stones", 3)
     write(folder / "a photograph.png", picture(150, 160, 9, (False, True)))
