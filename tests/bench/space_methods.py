@@ -76,7 +76,7 @@ class Methods:
         if done.returncode:
             said = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
             raise SolidgrainError(f"{photograph}: adapting with {features} failed: {said}")
-        cells.keep(out.with_name(f"{features}-adapted.json"), json.loads(done.stdout))
+        cells.keep(out.with_name(f"{features}-adapted.json"), {**json.loads(done.stdout), "texture": out.name})
         write_texture(out, replace(read_texture(part), name=out.parent.name))
         part.unlink()
 

@@ -83,11 +83,11 @@ def of_space(photographs: Photographs) -> str:
     lines += ["", "Mean ± deviation over photographs, and the median in brackets.", ""]
     lines += [of_window(window), ""] if window else []
     lines += ["Best to worst by the mean, oblique slices:", ""]
-    lines.append(f"- the paper's SIFID: {order(PAPER_SIFID, best_first)}")
+    lines.append(f"- the paper's SIFID: {order(PAPER_SIFID, least_first)}")
     lines.append(f"- the paper's ALL: {order(PAPER_ALL, most_first)}")
     for name, values in found[KINDS[0]].items():
         means = {column: (mean(by),) for column, by in values.items()}
-        key, theirs = (most_first, PAPER_ALL) if name == ALL else (best_first, PAPER_SIFID)
+        key, theirs = (most_first, PAPER_ALL) if name == ALL else (least_first, PAPER_SIFID)
         lines.append(f"- {name}: {order(means, key)}{agreement(means, theirs, key)}")
     return "\n".join([*lines, "", *contrasts(photographs)]).rstrip()
 
@@ -132,13 +132,13 @@ def of_far(photographs: Photographs) -> str:
     (name, cell), *_ = photographs.items()
     lines = [f"## A photograph unlike all that the space has seen: {name}", "", header("")]
     lines.append(row("SIFID × 10⁵ (the paper)", pairs(PAPER_FAR)))
-    notes = [f"- the paper's SIFID: {order(PAPER_FAR, best_first)}"]
+    notes = [f"- the paper's SIFID: {order(PAPER_FAR, least_first)}"]
     for kind, title in SLICES.items():
         for measure in measures(photographs):
             found = {column: figures(cell[column], kind)["ratios"][measure] for column in cell}
             lines.append(row(f"{measure} / floor, {title}", pairs(found)))
             if kind == KINDS[0]:
-                notes.append(f"- {measure}: {order(found, best_first)}{agreement(found, PAPER_FAR, best_first)}")
+                notes.append(f"- {measure}: {order(found, least_first)}{agreement(found, PAPER_FAR, least_first)}")
     return "\n".join([*lines, "", "Mean ± deviation over slices. Best to worst, oblique slices:", "", *notes])
 
 
@@ -178,7 +178,7 @@ def over_photographs(values: Sequence[float], digits: int) -> str:
     return f"{np.mean(values):.{digits}f} ± {np.std(values):.{digits}f} ({np.median(values):.{digits}f})"
 
 
-def best_first(found: Sequence[float]) -> float:
+def least_first(found: Sequence[float]) -> float:
     return found[0]
 
 
@@ -187,7 +187,8 @@ def most_first(found: Sequence[float]) -> float:
 
 
 def order(by_column: Pairs, key: Any) -> str:
-    return ", ".join(TITLES[column] for column in sorted(by_column, key=lambda column: key(by_column[column])))
+    sign = " < " if key is least_first else " > "
+    return sign.join(TITLES[column] for column in sorted(by_column, key=lambda column: key(by_column[column])))
 
 
 def agreement(ours: Pairs, theirs: Pairs, key: Any) -> str:

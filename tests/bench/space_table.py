@@ -100,9 +100,8 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add = made.add_argument
     add("--bundle", type=Path, required=True, metavar="FOLDER", help="the texture space, as solidgrain export made it")
-    add(
-        "--seconds", type=parse_seconds, default=60.0, metavar="S", help="of adapting to a photograph, with D and with VGG (60)"
-    )
+    add("--seconds", type=parse_seconds, default=60.0, metavar="S", help="of adapting, with D and with VGG (60)")
+    add("--iterations", type=parse_positive, metavar="N", help="of adapting, in the place of --seconds")
     add("--only-unadapted", action="store_true", help="leave the adapted columns for another time")
     add("--critic", type=Path, metavar="FILE", help="what adapting with D needs, where the bundle does not hold it")
     add("--henzler", type=Path, metavar="FOLDER", help="a space after Henzler et al., bundle or run, for a column of its own")

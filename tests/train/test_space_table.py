@@ -122,7 +122,7 @@ def test_a_table_grows_by_what_is_asked_and_nothing_is_made_twice(flags, adapted
     assert "| photographs | 2 | – | 2 | 2 | 2 |" in told
     assert "| iterations, seconds of adapting | – | – | – | 3, 4 | 3, 4 |" in told
     assert "A photograph unlike all that the space has seen: wood.png" in told
-    assert "- the paper's SIFID: ours, adapted (D), ours, adapted (VGG), ours, Henzler et al." in told
+    assert "- the paper's SIFID: ours, adapted (D) < ours, adapted (VGG) < ours < Henzler et al." in told
     found = json.loads((out / "table.json").read_text())
     unadapted, critic = (found["photographs"]["held-out"]["marble.png"][c]["oblique"] for c in ("unadapted", "critic"))
     assert unadapted == critic  # our adapting changed nothing: the same slices, the same figures
@@ -193,7 +193,9 @@ def test_another_method_has_a_column_of_its_own(flags, bundle, tmp_path):
     space_table.main([*flags, "--only-unadapted", "--only", "granite.png", "--henzler", str(bundle)])
     found = json.loads((tmp_path / "out" / "table.json").read_text())["photographs"]["held-out"]["granite.png"]
     assert found["henzler"] == found["unadapted"]  # it is the same space
-    assert "(not the paper's order)" in (tmp_path / "out" / "table.md").read_text() or found["henzler"]
+    told = (tmp_path / "out" / "table.md").read_text()
+    assert "- the paper's ALL: ground truth > ours > Henzler et al." in told
+    assert "that tells Henzler et al. from ours, or the last: it does not" in told
 
 
 def test_a_patch_is_compared_with_crops_that_it_does_not_overlap(monkeypatch):
