@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,7 @@ def of_space(photographs: Photographs) -> str:
     counts = {column: sum(column in cell for cell in photographs.values()) for column in present(photographs)}
     lines.append(row("photographs", {column: str(count) for column, count in counts.items()}))
     lines.append(row("iterations, seconds of adapting", adapting(photographs)))
-    lines += ["", "Mean ± deviation over photographs, and the median in brackets.", ""]
+    lines += ["", f"Mean ± deviation over photographs, and the median in brackets. {of_crops(photographs)}", ""]
     lines += [of_window(window), ""] if window else []
     lines += ["Best to worst by the mean, oblique slices:", ""]
     lines.append(f"- the paper's SIFID: {order(PAPER_SIFID, least_first)}")
@@ -90,6 +91,19 @@ def of_space(photographs: Photographs) -> str:
         key, theirs = (most_first, PAPER_ALL) if name == ALL else (least_first, PAPER_SIFID)
         lines.append(f"- {name}: {order(means, key)}{agreement(means, theirs, key)}")
     return "\n".join([*lines, "", *contrasts(photographs)]).rstrip()
+
+
+def of_crops(photographs: Photographs) -> str:
+    """What truth is, and at which size everything was compared."""
+    kinds = Counter(
+        (cell["truth"]["crop"], cell["truth"]["apart_from_patch"]) for cell in photographs.values() if "truth" in cell
+    )
+    ways = {
+        True: "slices and other crops with the encoded patch",
+        False: "slices with all disjoint crops, each crop with the others",
+    }
+    told = (f"{size}² pixels for {count}: {ways[apart]}" for (size, apart), count in sorted(kinds.items()))
+    return f"Compared are squares, of {'; of '.join(told)}." if kinds else ""
 
 
 def adapting(photographs: Photographs) -> dict[str, str]:

@@ -30,7 +30,7 @@ from tests.bench import cells, space_measure, space_table, space_values
 from tests.bench.signed_rank import signed_rank
 from tests.bench.space_measure import Reference, cut_crops
 from tests.bench.space_methods import Methods, open_henzler
-from tests.small_space import LATENT, small_space_weights
+from tests.toy_space import LATENT, toy_space_weights
 from tests.train.conftest import blotches
 from tests.train.spaces import new_space
 from tests.train.spaces import photographs as photographs_folder
@@ -56,8 +56,8 @@ def measure():
 def bundle(tmp_path_factory):
     """A space that sees 64² pixels, and says that it was never shown two photographs."""
     draw = np.random.default_rng(1)
-    dense = [(draw.standard_normal((3 * PATCH**2, LATENT)).astype(np.float32) / 8, np.zeros(LATENT, np.float32))]
-    weights = replace(small_space_weights(), encoder=EncoderWeights([], dense, PATCH))
+    dense = [(draw.standard_normal((3 * PATCH**2, LATENT)).astype(np.float32) / 32, np.zeros(LATENT, np.float32))]
+    weights = replace(toy_space_weights(), encoder=EncoderWeights([], dense, PATCH))
     details = Details(name="toys", patch=PATCH, training={"held_out": [*HELD_OUT], "iterations": 7})
     return write_bundle(tmp_path_factory.mktemp("bundles") / "toys", weights, details)
 
@@ -121,6 +121,7 @@ def test_a_table_grows_by_what_is_asked_and_nothing_is_made_twice(flags, adapted
     assert "| SIFID × 10⁵ (the paper, Table 2) | 2.46 ± 2.80 | 2.60 ± 2.85 | 2.47 ± 2.23 | – | – |" in told
     assert "| photographs | 2 | – | 2 | 2 | 2 |" in told
     assert "| iterations, seconds of adapting | – | – | – | 3, 4 | 3, 4 |" in told
+    assert "Compared are squares, of 32² pixels for 1: slices with all disjoint crops, each crop with" in told
     assert "A photograph unlike all that the space has seen: wood.png" in told
     assert "- the paper's SIFID: ours, adapted (D) < ours, adapted (VGG) < ours < Henzler et al." in told
     found = json.loads((out / "table.json").read_text())
@@ -183,10 +184,16 @@ def test_adapting_with_d_needs_it_before_anything_is_made(flags, tmp_path, capsy
     assert not (tmp_path / "out").exists()
 
 
-def test_a_failed_adapting_says_why(bundle, tmp_path):
-    methods = Methods(load_space(bundle), 1, ("--seconds", "1"), None, None)
-    with pytest.raises(SolidgrainError, match=r"nothing\.png: adapting with critic failed: .+"):
+def test_adapting_leaves_a_texture_that_is_called_like_its_photograph_or_says_why_not(toy_space_folder, tmp_path):
+    methods = Methods(load_space(toy_space_folder), 1, ("--iterations", "1"), None, None)
+    out = tmp_path / "stone.png" / "critic.sgt.npz"
+    out.parent.mkdir()
+    methods.adapt(written(out.with_name("exemplar.png"), blotches(128, 128)), out, "critic")
+    assert read_texture(out).name == "stone.png"
+    assert json.loads(out.with_name("critic-adapted.json").read_text())["iterations"] == 1
+    with pytest.raises(SolidgrainError, match=r"nothing\.png: adapting with critic failed: .*no such file"):
         methods.adapt(tmp_path / "nothing.png", tmp_path / "a.sgt.npz", "critic")
+    assert not list(tmp_path.rglob("*.part*"))
 
 
 def test_another_method_has_a_column_of_its_own(flags, bundle, tmp_path):
