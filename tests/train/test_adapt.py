@@ -36,7 +36,8 @@ from tests.toy_space import write_toy_critic
 from tests.train.spaces import new_space, picture, write
 
 CPU = torch.device("cpu")
-RECIPE = replace(DEFAULT, crops=8, warm_up=1, measured=2)
+# From a toy space, which knows nothing, the way is long: larger steps.
+RECIPE = replace(DEFAULT, octave_rate=1e-2, style_rate=1e-2, noise_rate=1e-2, crops=8, warm_up=1, measured=2)
 ARRAYS = ("transforms", "gamma", "delta", "noise_weights")
 
 
