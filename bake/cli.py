@@ -37,6 +37,7 @@ EXTRAS = {
     "spox": "export",
     "OpenEXR": "bake",
     "OpenImageIO": "bake",
+    "isal": "bake",
     "jsonschema": "bake",
     "distributed": "dask",
     "stlpips_pytorch": "evaluate",

@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, distributions, version
 from typing import Any
 
 PACKAGES = (
-    *("solidgrain", "numpy", "onnxruntime", "OpenEXR", "OpenImageIO", "jsonschema", "etcpak", "distributed"),
+    *("solidgrain", "numpy", "onnxruntime", "OpenEXR", "OpenImageIO", "isal", "jsonschema", "etcpak", "distributed"),
     *("pyvista", "vtk", "torch", "onnx", "spox"),
 )
 

@@ -1,9 +1,9 @@
 """`.exr`: a stack of OpenEXR slices, one per z, by default half-float and linear Rec.709.
 
 Row r of a file is y = r, its top row y = 0; column c is x = c; file number k (from `start`) is z = k - start. (Stacks along
-another axis are the same for a turned volume, see orient.py.) Written by the OpenEXR package, scanlines. It writes no time
-stamps, so equal plans give equal bytes. Attributes: `colorInteropID` and `chromaticities` say the encoding; `solidgrain:*`
-say which slice of which texture a file is.
+another axis are the same for a turned volume, see orient.py.) Written by the OpenEXR package, scanlines; ZIP by exr_zip.py. No
+file has a time stamp, so equal plans give equal bytes. Attributes: `colorInteropID` and `chromaticities` say the encoding;
+`solidgrain:*` say which slice of which texture a file is.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from solidgrain.bake.color import LINEAR, SRGB, to_half, to_linear
 from solidgrain.bake.frames import frame_paths
 from solidgrain.bake.store import Encoded, Finished, Store
 from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
+from solidgrain.bake.writers.exr_zip import LINES, deflated
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.workers import Workers
 
@@ -57,9 +58,9 @@ class ExrStack(Writer):
     def _encode_slice(self, z: int, rgb: FloatArray) -> bytes:
         import OpenEXR
 
-        file = io.BytesIO()
+        file, compression = io.BytesIO(), str(self.output.options["compression"])
         OpenEXR.File(slice_header(self.output, self.volume, z), self._channels(rgb)).write(file)
-        return file.getvalue()
+        return deflated(file.getvalue(), compression) if compression in LINES else file.getvalue()
 
     def _channels(self, srgb: FloatArray) -> dict[str, npt.NDArray[np.generic]]:
         """What the file's channels hold, [y, x] each; plain RGB in one piece, which is faster."""
@@ -93,14 +94,14 @@ class ExrStack(Writer):
 
 
 def slice_header(output: Output, volume: Volume, z: int) -> dict[str, Any]:
-    """The attributes of one slice."""
+    """The attributes of one slice, as the OpenEXR package is to write it: what exr_zip.py compresses, uncompressed."""
     import OpenEXR
 
+    compression = str(output.options["compression"])
+    written = "NO" if compression == "none" or compression in LINES else compression.upper()
     column, row, along = (volume.axes[k : k + 2].lstrip("+") for k in (0, 2, 4))
     header: dict[str, Any] = {
-        "compression": getattr(
-            OpenEXR, {"none": "NO"}.get(name := str(output.options["compression"]), name.upper()) + "_COMPRESSION"
-        ),
+        "compression": getattr(OpenEXR, f"{written}_COMPRESSION"),
         "type": OpenEXR.scanlineimage,
         **color_attributes(output),
         "solidgrain:texture": volume.texture,
