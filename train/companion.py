@@ -18,7 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from solidgrain.runtime.bundle import CRITIC, Bundle
+from solidgrain.runtime.bundle import CRITIC, Bundle, embedded_folder, open_bundle
 from solidgrain.runtime.errors import BundleError
 from solidgrain.runtime.files import DAMAGED_ARCHIVE
 from solidgrain.train.critic import Critic
@@ -43,6 +43,14 @@ def find_companion(bundle: Bundle, named: Path | None) -> Path:
         ways = "choose another --critic" if named else "export its run with --companion, or name the file with --critic"
         raise BundleError(f"{path}: missing; adapting needs the critic of the space: {ways}, or adapt with --features vgg")
     return path
+
+
+def first_critic(settings: Settings, generator: torch.Generator) -> Critic:
+    """D when a training begins: random, or what it has learned beside an embedded space. Raises BundleError if that is gone."""
+    if not settings.critic_start:
+        return Critic(generator)
+    bundle = open_bundle(embedded_folder(settings.critic_start))
+    return read_companion(find_companion(bundle, None), bundle).critic.requires_grad_(True).to(generator.device)
 
 
 def read_companion(path: Path, bundle: Bundle) -> Companion:

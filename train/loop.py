@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from solidgrain.runtime.errors import TrainingError
-from solidgrain.train.critic import Critic
+from solidgrain.train.companion import first_critic
 from solidgrain.train.losses import gradient_penalty, make_judge, style_loss
 from solidgrain.train.preview import write_preview
 from solidgrain.train.processes import Processes
@@ -46,7 +46,8 @@ class Trainer:
         self.run, self.settings, self.device, self.processes = run, run.settings, device, processes
         self.task = make_task(run, device)
         self.generator = torch.Generator(device).manual_seed(self.settings.seed)
-        self.critic = Critic(self.generator).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        critic = first_critic(self.settings, self.generator)
+        self.critic = critic.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.judge = make_judge(self.settings, self.critic, device)
         self.sampler = self.task.make_model(self.generator)
         self.average = copy.deepcopy(self.sampler).requires_grad_(False)

@@ -24,6 +24,7 @@ TINY_SPACE = {
     "sample_every": 1000,
     "report_every": 1,
     "precision": "float32",
+    "critic_start": "",
 }
 SIZES = ((130, 150), (200, 128), (160, 160), (129, 171))
 

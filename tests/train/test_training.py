@@ -31,6 +31,7 @@ TINY = {
     "sample_every": 4,
     "report_every": 1,
     "precision": "float32",
+    "critic_start": "",
 }
 CPU = torch.device("cpu")
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from solidgrain.runtime import TrainingError
+from solidgrain.runtime import BundleError, TrainingError
+from solidgrain.runtime.bundle import embedded_folder, open_bundle
 from solidgrain.train import critic, loop, settings
+from solidgrain.train.companion import find_companion, read_companion
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.run import open_run
 from solidgrain.train.settings import Budget, preset
@@ -25,7 +27,7 @@ def small(monkeypatch):
     torch.set_num_threads(1)
     monkeypatch.setattr(loop, "_write_sample", lambda trainer: None)
     monkeypatch.setattr(critic, "CONVOLUTIONS", ((3, 16, 3, True), (16, 32, 3, True), (32, 256, 3, True)))
-    tiny = {"fast": preset("fast", patch=32, **SAME_WIDTH), "fast space": preset("fast space", **TINY_SPACE)}
+    tiny = {"fast": preset("fast", patch=32, critic_start="", **SAME_WIDTH), "fast space": preset("fast space", **TINY_SPACE)}
     monkeypatch.setattr(settings, "PRESETS", settings.PRESETS | tiny)
 
 
@@ -153,3 +155,20 @@ def test_a_failed_warm_start_is_one_line_and_leaves_no_run_behind(solidgrain, tm
     assert ("already holds a run" if what == "itself" else message) in outcome.error
     assert not (tmp_path / "run").exists()
     assert {path: path.stat().st_mtime_ns for path in single.folder.rglob("*")} == before
+
+
+def test_a_fast_training_begins_with_the_critic_of_the_embedded_space(monkeypatch, tmp_path, photograph):
+    monkeypatch.undo()  # D at its full size
+    learned = read_companion(find_companion(open_bundle(embedded_folder("stone")), None), open_bundle(embedded_folder("stone")))
+    warm = Trainer(new_run(tmp_path / "warm", photograph, critic_start="stone"), CPU).critic
+    fresh = Trainer(new_run(tmp_path / "fresh", photograph), CPU).critic
+    for name, value in learned.critic.state_dict().items():
+        torch.testing.assert_close(warm.state_dict()[name], value, rtol=0, atol=0)
+    assert all(parameter.requires_grad for parameter in warm.parameters())
+    assert not torch.equal(fresh.dense.weight, warm.dense.weight)
+    assert [preset(name).critic_start for name in ("fast", "fast space", "paper", "paper space")] == ["stone", "stone", "", ""]
+
+
+def test_a_critic_that_is_not_there_is_one_line(monkeypatch, tmp_path, photograph):
+    with pytest.raises(BundleError, match="no such texture"):
+        Trainer(new_run(tmp_path / "run", photograph, critic_start="stones"), CPU)

@@ -1,0 +1,69 @@
+"""The recipe's table: rows differ in what they say, every mark is measured once, and what is finished is kept."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("stlpips_pytorch", reason="the measures need VGG-16: pip install 'solidgrain[evaluate]'")
+
+from solidgrain.train import preview
+from solidgrain.train.quality import Evaluation
+from solidgrain.train.settings import FAST, PAPER, preset
+from tests.bench import cells, recipe
+from tests.train.conftest import blotches
+from tests.train.test_training import TINY
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """Two rows and one exemplar, at the size of toys; the flags of the command."""
+    torch.set_num_threads(1)
+    monkeypatch.setattr(preview, "SIZE", 32)
+    tiny = preset("fast", **TINY)
+    quality = {name: (1.0, 0.0) for name in ("vgg_frechet", "gram")}
+    monkeypatch.setattr(recipe, "evaluate", lambda *_: Evaluation(64, 1, {}, quality, quality))
+    monkeypatch.setattr(recipe, "ROWS", {"fast": ("the preset", tiny), "colors": ("plain", tiny)})
+    cells.write_png(tmp_path / "blotches.png", np.kron(blotches(128, 150), np.ones((1, 2, 1), np.float32)))
+    where = ["--out", str(tmp_path / "out"), "--exemplar", str(tmp_path / "blotches.png")]
+    return [*where, "--minutes", "0.02", "--slices", "1", "--seeds", "1", "--threads", "1"]
+
+
+def test_a_row_differs_from_the_preset_in_what_it_names_and_is_the_paper_s_there():
+    for name, (_, settings) in recipe.ROWS.items():
+        changed = {key for key, value in asdict(settings).items() if value != asdict(FAST)[key]}
+        assert bool(changed) == (name != "fast")
+        assert all(asdict(settings)[key] == asdict(PAPER)[key] for key in changed)
+
+
+def test_every_departure_of_the_preset_from_the_paper_has_its_row():
+    settled = {"preset", "average_decay"}
+    departures = {key for key, value in asdict(FAST).items() if value != asdict(PAPER)[key]} - settled
+    rows = [
+        {key for key, value in asdict(settings).items() if value != asdict(FAST)[key]} for _, settings in recipe.ROWS.values()
+    ]
+    assert departures == set.union(*rows)
+
+
+def test_the_table_has_every_row_at_every_mark_and_a_second_start_changes_nothing(small, tmp_path, capsys):
+    recipe.main(small)
+    printed = capsys.readouterr().out
+    assert [line.split("|")[1].strip() for line in printed.strip().splitlines()[2:]] == ["the preset", "plain"]
+    assert printed.count("1.00 (1.00)") == 12
+    found = json.loads((tmp_path / "out" / "table.json").read_text())
+    assert {row: len(marks) for row, marks in found.items()} == {"fast": 3, "colors": 3}
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*-0-*.json")}
+    recipe.main([*small, "--resume"])
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+
+
+def test_what_cannot_be_run_is_refused_in_one_line(small, tmp_path, capsys):
+    assert cells.reported(lambda: recipe.main([*small, "--only", "magic"])) == 2
+    assert "expected one of" in capsys.readouterr().err
+    assert cells.reported(lambda: recipe.main([*small, "--exemplar", str(tmp_path / "none.png")])) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
