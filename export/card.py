@@ -25,7 +25,8 @@ def write_card(name: str, training: dict[str, Any]) -> str:
         if len(training["exemplars"]) > MANY
         else [
             f"- `{entry['exemplar']}`, licence: {entry['license'] or 'not stated'}, credit: {entry['credit'] or 'not stated'}\n"
-            f"  (read as {entry.get('colorspace') or 'not stated'}, sha256 of its pixels `{entry['sha256'][:16]}…`)"
+            f"  (read as {entry.get('colorspace') or 'not stated'}{_reduced(entry)}, sha256 of its pixels "
+            f"`{entry['sha256'][:16]}…`)"
             for entry in training["exemplars"]
         ]
     )
@@ -34,6 +35,11 @@ def write_card(name: str, training: dict[str, Any]) -> str:
     kind = "A space of solid textures" if settings.get("latent") else "A solid texture"
     lines = [f"# {name}", "", f"{kind}, trained on:", "", *exemplars, "", "| | |", "|---|---|"]
     return "\n".join([*lines, *(f"| {label} | {value} |" for label, value in rows), ""])
+
+
+def _reduced(entry: dict[str, Any]) -> str:
+    scale = entry.get("scale", 1)
+    return "" if scale == 1 else f", reduced to one pixel for every {scale:g}"
 
 
 def _grouped(exemplars: list[dict[str, Any]]) -> list[str]:

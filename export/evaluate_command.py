@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from solidgrain.bake.arguments import parse_count, parse_positive
+from solidgrain.bake.arguments import parse_count, parse_positive, parse_scale
 from solidgrain.runtime.errors import UsageError
 
 SHEETS = (".png", ".html")
@@ -18,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("source", metavar="SOURCE", help="embedded name, bundle or texture file")
     add("--bundle", metavar="FOLDER", help="the bundle of a texture file")
     add("--exemplar", type=Path, required=True, metavar="PHOTO", help="the photograph that it was trained on")
+    add("--patch-scale", type=parse_scale, metavar="S", help="photograph's pixels per exemplar pixel (as it was trained)")
     add(
         "--slices", type=parse_positive, default=50, metavar="N", help="axis-aligned and oblique slices, one instance each (50)"
     )
@@ -29,7 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from solidgrain.export.evaluation import grain_of, measure, write_quality
+    from solidgrain.bake.sources import scaled
+    from solidgrain.export.evaluation import grain_of, measure, scale_of, write_quality
     from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load_texture
     from solidgrain.train.inception import Inception
@@ -40,7 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
         check_sheet(arguments.sheet, arguments.exemplar)
     inception = Inception(arguments.inception) if arguments.inception else None
     texture = load_texture(arguments.source, bundle=arguments.bundle, threads=arguments.threads)
-    exemplar = read_exemplar(arguments.exemplar, SMALLEST)
+    scale = arguments.patch_scale or scale_of(texture.bundle)
+    exemplar = scaled(read_exemplar(arguments.exemplar, round(SMALLEST * scale)), scale)
     print(f"measuring {2 * arguments.slices} slices of {texture.name}", file=sys.stderr)
     found = measure(texture, exemplar, arguments.slices, inception)
     figures = found.figures

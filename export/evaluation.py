@@ -36,6 +36,12 @@ def grain_of(bundle: Bundle) -> str:
     return str(bundle.manifest["training"].get("settings", {}).get("grain", "none"))
 
 
+def scale_of(bundle: Bundle) -> float:
+    """How many pixels of the photograph were one of the exemplar that a texture was learned from; 1 for a space."""
+    entries = bundle.manifest["training"].get("exemplars", [])
+    return float(entries[0].get("scale", 1.0)) if len(entries) == 1 else 1.0
+
+
 def measure(texture: Texture, exemplar: FloatArray, slices: int, inception: Inception | None = None) -> Measured:
     """Measure so many axis-aligned and as many oblique slices of a texture, and whether it copies its exemplar."""
     grain = grain_of(texture.bundle)

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal
 
-from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive, parse_seed
+from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive, parse_scale, parse_seed
 from solidgrain.runtime.errors import TrainingError, UsageError
 from solidgrain.train.variants import CHANGES, canonical
 
@@ -28,6 +28,7 @@ FIXED = (
     "preset",
     "variant",
     "anisotropic",
+    "patch_scale",
     "patch",
     "batch",
     "seed",
@@ -67,6 +68,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "x", "y"),
         metavar="AXIS",
         help="oriented material: slices turn about the grain, image axis x or y (measured if not given)",
+    )
+    add(
+        "--patch-scale",
+        type=parse_scale,
+        metavar="S",
+        help="photograph's pixels per exemplar pixel; patches see more of it (1)",
     )
     add("--patch", type=parse_positive, metavar="PX", help="pixels along each side of a patch, at least 32")
     add("--batch", type=parse_positive, metavar="N", help="patches per iteration")
@@ -154,6 +161,8 @@ def start_space(arguments: argparse.Namespace) -> RunFolder:
     from solidgrain.train.run import Source
     from solidgrain.train.space_run import create_space_run
 
+    if arguments.patch_scale is not None:
+        raise UsageError("--patch-scale: is about one photograph, not about those of a --space; resize those that need it")
     if arguments.exemplar is not None:
         raise UsageError(f"--space {arguments.space}: learns from all its photographs; leave {arguments.exemplar} out")
     settings = make_settings(arguments)
@@ -184,6 +193,7 @@ def held_out_names(text: str | None) -> int | list[str]:
 
 def start(arguments: argparse.Namespace) -> Run:
     """A new run directory for the photograph, with a warning if one texture cannot describe it."""
+    from solidgrain.bake.sources import scaled
     from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
     from solidgrain.train.photograph import read_photograph
     from solidgrain.train.run import Source, create_run
@@ -196,7 +206,11 @@ def start(arguments: argparse.Namespace) -> Run:
     settings = make_settings(arguments)
     if settings.style_features == "vgg":
         find_weights()  # before there is a run directory
-    exemplar, colorspace, warning = read_photograph(arguments.exemplar, settings.patch)
+    scale = arguments.patch_scale or 1.0
+    if scale < 1:
+        raise UsageError(f"--patch-scale {scale:g}: expected 1 or more; photographs are reduced, never enlarged")
+    exemplar, colorspace, warning = read_photograph(arguments.exemplar, round(settings.patch * scale))
+    exemplar = scaled(exemplar, scale)
     if warning:
         print(f"warning: {arguments.exemplar}: {warning}", file=sys.stderr)
     if (found := nonstationarity(exemplar)) > NONSTATIONARY:
@@ -206,7 +220,7 @@ def start(arguments: argparse.Namespace) -> Run:
             file=sys.stderr,
         )
     settings = with_grain(settings, arguments.anisotropic, exemplar)
-    source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace)
+    source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace, scale)
     return create_run(arguments.out, settings, exemplar, source, make_budget(arguments, settings))
 
 

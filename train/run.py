@@ -46,6 +46,7 @@ class Source:
     license: str
     credit: str
     colorspace: str = ""  # what its colours were read as, "" in runs that do not say
+    scale: float = 1.0  # photograph's pixels per exemplar pixel
 
 
 @dataclass(frozen=True)

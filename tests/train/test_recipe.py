@@ -25,7 +25,7 @@ def small(monkeypatch, tmp_path):
     torch.set_num_threads(1)
     monkeypatch.setattr(preview, "SIZE", 32)
     tiny = preset("fast", **TINY)
-    quality = {name: (1.0, 0.0) for name in ("vgg_frechet", "gram")}
+    quality = dict.fromkeys(("vgg_frechet", "gram"), (1.0, 0.0))
     monkeypatch.setattr(recipe, "evaluate", lambda *_: Evaluation(64, 1, {}, quality, quality))
     monkeypatch.setattr(recipe, "ROWS", {"fast": ("the preset", tiny), "colors": ("plain", tiny)})
     cells.write_png(tmp_path / "blotches.png", np.kron(blotches(128, 150), np.ones((1, 2, 1), np.float32)))

@@ -14,13 +14,16 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
+from solidgrain.export.evaluation import scale_of
 from solidgrain.export.from_run import check_agreement, export_run, sampler_weights
 from solidgrain.runtime import BundleError, TrainingError, load
+from solidgrain.runtime.bundle import open_bundle
 from solidgrain.train.loop import train
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import Budget, preset
+from tests.train.conftest import blotches
 
 TINY = {
     "octaves": 4,
@@ -214,6 +217,20 @@ def test_the_command_line_trains_and_exports(solidgrain, tmp_path, photograph):
     assert solidgrain("bake", tmp_path / "bundle", "--size", 4, "--out", tmp_path / "a.npy").code == 0
 
 
+def test_a_photograph_can_be_reduced_and_its_bundle_remembers_by_how_much(solidgrain, tmp_path):
+    grey = np.kron(blotches(70, 65).mean(2, keepdims=True), np.ones((2, 2, 3), np.float32))  # 140 x 130
+    oiio.ImageBuf(np.ascontiguousarray(grey, np.float32)).write(os.fspath(tmp_path / "large.png"), oiio.UINT8)
+    flags = ["--iterations", 1, "--patch", 32, "--batch", 1, "--threads", 1, "--patch-scale", 2]
+    assert solidgrain("train", tmp_path / "large.png", "--out", tmp_path / "run", *flags).code == 0
+    run = open_run(tmp_path / "run")
+    assert run.exemplar.shape == (70, 65, 3)
+    np.testing.assert_allclose(run.exemplar, grey[::2, ::2], atol=1 / 255)
+    assert solidgrain("export", tmp_path / "run", "--out", tmp_path / "bundle").code == 0
+    bundle = open_bundle(tmp_path / "bundle")
+    assert scale_of(bundle) == 2
+    assert "one pixel for every 2" in (bundle.folder / "card.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("flags", "code", "message"),
     [
@@ -225,6 +242,8 @@ def test_the_command_line_trains_and_exports(solidgrain, tmp_path, photograph):
         (["--threads", "-5"], 2, "--threads"),
         (["--patch", "8"], 2, "--patch 8"),
         (["--patch", "81"], 1, "expected at least 81x81"),
+        (["--patch-scale", "2"], 1, "expected at least 128x128"),
+        (["--patch-scale", "0.5"], 2, "never enlarged"),
         (["--batch", "0"], 2, "--batch"),
         (["--preset", "slow"], 2, "--preset"),
         (["--anisotropic", "z"], 2, "--anisotropic"),
