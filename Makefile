@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 WHEEL_VENV := build/wheel-venv
 
-.PHONY: install check test test-slow wheel test-wheel sanitize bench bench-bake paper-table space-table ground-truth textures pictures clean
+.PHONY: install check test test-slow wheel test-wheel sanitize bench bench-bake recipe-table paper-table space-table ground-truth textures pictures clean
 
 install: $(VENV)/installed
 
@@ -63,6 +63,10 @@ bench-bake: install
 MINUTES ?= 20
 paper-table: install
 	$(BIN)/python -m tests.bench.paper_table --minutes $(MINUTES) --resume
+
+# What each switch of the recipe is worth, or with FLAGS="--only fast --exemplar PHOTO --largest 2048 --marks 5,15,30,60" its figures.
+recipe-table: install
+	$(BIN)/python -m tests.bench.recipe --resume $(FLAGS)
 
 # A texture space on the photographs that it was never shown. FLAGS=--only-unadapted is the quicker half, FLAGS=--large all of it.
 BUNDLE ?= stone

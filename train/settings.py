@@ -79,6 +79,11 @@ class Settings:
         return self.alpha != 0 or self.style_features == "critic"
 
     @property
+    def compares_relatively(self) -> bool:
+        """Whether L_style divides by the size of the real Gram matrix; with VGG's features always, which nobody scales."""
+        return self.relative_gram or self.style_features == "vgg"
+
+    @property
     def gram_groups(self) -> int:
         """Groups of patches whose Gram matrices are compared: all of an exemplar's, or each patch alone."""
         if not self.pooled_gram:

@@ -42,11 +42,8 @@ PLAN = "plan.json"
 
 
 def arguments_of(what: str, out: Path, slices: int) -> argparse.ArgumentParser:
-    """The flags of every comparison."""
+    """The flags of every comparison, but for how long it trains."""
     parser = argparse.ArgumentParser(description=what)
-    budget = parser.add_mutually_exclusive_group(required=True)
-    budget.add_argument("--minutes", type=parse_minutes, metavar="M", help="of training for each cell")
-    budget.add_argument("--iterations", type=parse_positive, metavar="N", help="of training for each cell")
     parser.add_argument(
         "--slices", type=parse_positive, default=slices, metavar="N", help=f"to measure of each kind ({slices})"
     )
@@ -60,6 +57,13 @@ def arguments_of(what: str, out: Path, slices: int) -> argparse.ArgumentParser:
     return parser
 
 
+def add_budget(parser: argparse.ArgumentParser) -> None:
+    """How long to train each cell."""
+    budget = parser.add_mutually_exclusive_group(required=True)
+    budget.add_argument("--minutes", type=parse_minutes, metavar="M", help="of training for each cell")
+    budget.add_argument("--iterations", type=parse_positive, metavar="N", help="of training for each cell")
+
+
 def prepare(arguments: argparse.Namespace, **asked: Any) -> tuple[torch.device, Inception | None]:
     """Check all that can be checked before hours of training, and write or compare the plan."""
     find_weights()
@@ -67,7 +71,7 @@ def prepare(arguments: argparse.Namespace, **asked: Any) -> tuple[torch.device, 
     if arguments.device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: torch sees no CUDA device; use --device cpu")
     torch.set_num_threads(arguments.threads or usable_threads())
-    plan = {**{name: getattr(arguments, name) for name in ("minutes", "iterations", "slices", "device")}, **asked}
+    plan = {name: vars(arguments)[name] for name in ("minutes", "iterations", "slices", "device") if name in arguments} | asked
     plan["sifid"] = inception is not None
     settle(arguments.out, plan, arguments.resume)
     return torch.device(arguments.device), inception

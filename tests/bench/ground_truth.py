@@ -49,6 +49,7 @@ Look = Callable[[int, Tensor], Tensor]  # seed, rotation -> a slice [1, 3, CROP,
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = cells.arguments_of(__doc__.splitlines()[0], Path("build/ground-truth"), slices=24)
+    cells.add_budget(parser)
     arguments = parser.parse_args(argv)
     device, inception = cells.prepare(arguments, solids=sorted(SOLIDS), true_slices=TRUE_SLICES)
     for name in SOLIDS:

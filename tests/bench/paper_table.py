@@ -61,6 +61,7 @@ Cells = Mapping[str, Mapping[str, Any]]  # by column
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = cells.arguments_of(__doc__.splitlines()[0], Path("build/paper-table"), slices=50)
+    cells.add_budget(parser)
     for kind, path in DEFAULTS.items():
         parser.add_argument(f"--{kind}", type=Path, default=path, metavar="PHOTO", help=f"the {kind} of the table")
     arguments = parser.parse_args(argv)

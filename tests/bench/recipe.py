@@ -1,14 +1,16 @@
 """`make recipe-table`: what each departure of the `fast` preset from the paper is worth, by quality over time.
 
-python -m tests.bench.recipe --minutes 6 --threads 1 --seeds 1 --out FOLDER [--only ROW] [--exemplar FILE] [--resume]
+python -m tests.bench.recipe --marks 2,4,6 --threads 1 --out FOLDER [--only ROW] [--exemplar PHOTO] [--resume]
 
 Each row is the preset with one setting, or one group of them, as the paper has it. Every row is trained on the same exemplars
-with the same seeds, and measured after a third of its minutes, two thirds, and all: VGG-Fréchet and Gram distance of oblique
-slices over the exemplar's floor, the geometric mean over exemplars and seeds, and the worst. table.json has all measures.
+with the same seeds, and measured after so many minutes of training: VGG-Fréchet and Gram distance of oblique slices over the
+exemplar's floor, the geometric mean over exemplars and seeds, and the worst. A second table has the preset's figures for each
+exemplar, a row for each measure; table.json has everything.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -18,8 +20,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from solidgrain.bake.arguments import parse_minutes, parse_positive
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.files import replacing
+from solidgrain.train.command import with_grain
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import evaluate
@@ -32,10 +36,11 @@ DEFAULTS = [
     EXEMPLARS.parent / "stone128" / "Terrazzo010.png",
     EXEMPLARS.parent / "stone128" / "Marble010.png",
 ]
-MARKS = (1 / 3, 2 / 3, 1.0)  # of the minutes
+MARKS = [2.0, 4.0, 6.0]  # minutes
 LARGEST = 256  # pixels: of larger photographs the middle
 SMALLEST = 128
 SHOWN = ("vgg_frechet", "gram")
+Found = Mapping[str, Mapping[str, Mapping[str, Any]]]  # by row, then by cell: exemplar, seed and mark
 
 
 def as_paper(*names: str) -> Settings:
@@ -69,80 +74,115 @@ ROWS: dict[str, tuple[str, Settings]] = {
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = cells.arguments_of(__doc__.splitlines()[0], Path("build/recipe"), slices=8)
-    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="trainings of each row and exemplar (2)")
-    parser.add_argument("--only", action="append", default=[], metavar="ROW", help=f"of {', '.join(ROWS)} (all)")
-    parser.add_argument("--exemplar", action="append", type=Path, default=[], metavar="PHOTO", help="instead of the three")
-    arguments = parser.parse_args(argv)
-    if arguments.minutes is None:
-        raise UsageError("--iterations: rows take unlike times for an iteration; give --minutes")
-    if strange := [name for name in arguments.only if name not in ROWS]:
-        raise UsageError(f"--only {strange[0]}: no such row; expected one of {', '.join(ROWS)}")
-    paths = arguments.exemplar or DEFAULTS
-    exemplars = {path.stem: middle(path) for path in paths}
-    device, _ = cells.prepare(arguments, exemplars=sorted(exemplars))
+    arguments = parse(argv)
+    exemplars = {path.stem: middle(path, arguments.largest) for path in arguments.exemplar or DEFAULTS}
+    grained = {path.stem: middle(path, arguments.largest) for path in arguments.anisotropic}
+    device, _ = cells.prepare(arguments, marks=arguments.marks, largest=arguments.largest)
     for seed in range(arguments.seeds):
         for row in arguments.only or ROWS:
-            for name, exemplar in exemplars.items():
+            for name, exemplar in (exemplars | grained).items():
+                settings = replace(ROWS[row][1], seed=seed)
+                settings = with_grain(settings, "auto" if name in grained else None, exemplar)
                 folder = arguments.out / row / f"{name}-{seed}"
-                finish_cell(folder, replace(ROWS[row][1], seed=seed), exemplar, arguments.minutes, arguments.slices, device)
-                write_results(arguments.out)
+                for minutes in arguments.marks:
+                    finish_mark(folder, settings, exemplar, minutes, arguments.slices, device)
+                    write_results(arguments.out, arguments.marks)
     print((arguments.out / "table.md").read_text("utf-8"))
 
 
-def middle(path: Path) -> FloatArray:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = cells.arguments_of(__doc__.splitlines()[0], Path("build/recipe"), slices=8)
+    add = parser.add_argument
+    add(
+        "--marks", type=parse_marks, default=MARKS, metavar="M,M,...", help="minutes of training after which to measure (2,4,6)"
+    )
+    add("--seeds", type=parse_positive, default=2, metavar="N", help="trainings of each row on each exemplar (2)")
+    add("--only", action="append", default=[], choices=ROWS, metavar="ROW", help=f"of {', '.join(ROWS)} (all)")
+    add("--exemplar", action="append", type=Path, default=[], metavar="PHOTO", help="instead of the three; may be repeated")
+    add("--anisotropic", action="append", type=Path, default=[], metavar="PHOTO", help="another one, with a grain")
+    add("--largest", type=parse_positive, default=LARGEST, metavar="PX", help=f"of larger photographs the middle ({LARGEST})")
+    return parser.parse_args(argv)
+
+
+def parse_marks(text: str) -> list[float]:
+    return sorted(parse_minutes(mark) for mark in text.split(","))
+
+
+def middle(path: Path, largest: int) -> FloatArray:
     """An exemplar, or what is in the middle of it."""
     if not path.is_file():
         raise UsageError(f"--exemplar {path}: no such file; give photographs of at least {SMALLEST}x{SMALLEST} pixels")
     pixels = read_exemplar(path, SMALLEST)
-    top, left = (max(0, extent - LARGEST) // 2 for extent in pixels.shape[:2])
-    return np.ascontiguousarray(pixels[top : top + LARGEST, left : left + LARGEST])
+    top, left = (max(0, extent - largest) // 2 for extent in pixels.shape[:2])
+    return np.ascontiguousarray(pixels[top : top + largest, left : left + largest])
 
 
-def finish_cell(
+def finish_mark(
     folder: Path, settings: Settings, exemplar: FloatArray, minutes: float, slices: int, device: torch.device
 ) -> None:
-    """Train one row on one exemplar, and measure at each mark what was not measured before."""
-    for mark in MARKS:
-        result = folder.with_name(f"{folder.name}-{mark:.2f}.json")
-        if result.exists():
-            continue
-        cells.say(f"{folder.parent.name}, {folder.name}: until minute {mark * minutes:g}")
-        run = cells.trained(folder, settings, exemplar, Budget(minutes=mark * minutes), device)
-        found: dict[str, Any] = {**run.facts, "mark": mark, "settings": asdict(settings)}
-        if run.iterations:
-            found["quality"] = asdict(evaluate(exemplar, cells.sampling(run.run, device), slices))
-        cells.keep(result, found)
+    """Train one row on one exemplar until a mark, and measure, unless that was done before."""
+    result = folder.with_name(f"{folder.name}-{minutes:g}.json")
+    if result.exists():
+        return
+    cells.say(f"{folder.parent.name}, {folder.name}: until minute {minutes:g}")
+    run = cells.trained(folder, settings, exemplar, Budget(minutes=minutes), device)
+    found: dict[str, Any] = {"exemplar": folder.name, "mark": minutes, **run.facts, "settings": asdict(settings)}
+    if run.iterations:
+        found["quality"] = asdict(evaluate(exemplar, cells.sampling(run.run, device), slices, settings.grain))
+    cells.keep(result, found)
 
 
-def write_results(out: Path) -> None:
+def write_results(out: Path, marks: Sequence[float]) -> None:
     """table.md and table.json of what is finished."""
-    found = {row: marks for row in ROWS if (marks := collected(out / row))}
+    found = {row: measured for row in ROWS if (measured := collected(out / row))}
     cells.keep(out / "table.json", found)
     with replacing(out / "table.md") as file:
-        file.write(table(found).encode() + b"\n")
+        file.write(f"{rows_table(found, marks)}\n\n{exemplars_table(found.get('fast', {}), marks)}\n".encode())
 
 
 def collected(folder: Path) -> dict[str, dict[str, Any]]:
-    """What was measured of a row, by the names of its cells."""
+    """What was measured of a row, by the names of its files."""
     return {path.stem: cell for path in sorted(folder.glob("*.json")) if (cell := cells.kept(path))}
 
 
-def table(found: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+def rows_table(found: Found, marks: Sequence[float]) -> str:
     """One line per row, in Markdown."""
-    heads = [f"{name} at {mark:.0%}" for name in SHOWN for mark in MARKS]
-    lines = [f"| | {' | '.join(heads)} | iterations |", "|---" * (len(heads) + 2) + "|"]
-    for row, marks in found.items():
-        figures = [figure(marks.values(), name, mark) for name in SHOWN for mark in MARKS]
-        last = [cell["iterations"] for cell in marks.values() if cell["mark"] == MARKS[-1]]
-        lines.append(f"| {ROWS[row][0]} | {' | '.join(figures)} | {np.mean(last):.0f} |" if last else f"| {ROWS[row][0]} | … |")
+    lines = titles("", [f"{name}, {mark:g} min" for name in SHOWN for mark in marks] + ["iterations"])
+    for row, measured in found.items():
+        figures = [over_all(values(measured, "oblique", name, mark)) for name in SHOWN for mark in marks]
+        longest = max(cell["mark"] for cell in measured.values())
+        iterations = np.mean([cell["iterations"] for cell in measured.values() if cell["mark"] == longest])
+        lines.append(f"| {ROWS[row][0]} | {' | '.join(figures)} | {iterations:.0f} |")
     return "\n".join(lines)
 
 
-def figure(measured: Any, name: str, mark: float) -> str:
-    """A measure at a mark: the geometric mean, and the worst."""
-    values = [cell["quality"]["oblique"][name][0] for cell in measured if cell["mark"] == mark and "quality" in cell]
-    return f"{np.exp(np.mean(np.log(values))):.2f} ({max(values):.2f})" if values else "–"
+def exemplars_table(measured: Mapping[str, Mapping[str, Any]], marks: Sequence[float]) -> str:
+    """The preset's figures, one line per exemplar and seed: axis-aligned / oblique slices."""
+    by_exemplar: dict[str, dict[str, Any]] = {}
+    for name, cell in measured.items():
+        by_exemplar.setdefault(cell["exemplar"], {})[name] = cell
+    lines = titles("the preset: axis-aligned / oblique", [f"{name}, {mark:g} min" for name in SHOWN for mark in marks])
+    for exemplar, own in by_exemplar.items():
+        pairs = [[over_all(values(own, kind, name, mark)) for kind in ("axis", "oblique")] for name in SHOWN for mark in marks]
+        lines.append(f"| {exemplar} | {' | '.join(' / '.join(pair) for pair in pairs)} |")
+    return "\n".join(lines)
+
+
+def titles(first: str, others: Sequence[str]) -> list[str]:
+    return [f"| {first} | {' | '.join(others)} |", "|---" * (len(others) + 1) + "|"]
+
+
+def values(measured: Mapping[str, Mapping[str, Any]], kind: str, name: str, mark: float) -> list[float]:
+    """A measure at a mark, of all exemplars and seeds that have it."""
+    return [cell["quality"][kind][name][0] for cell in measured.values() if cell["mark"] == mark and "quality" in cell]
+
+
+def over_all(found: Sequence[float]) -> str:
+    """The geometric mean, and the worst if there are several."""
+    if not found:
+        return "–"
+    worst = f" ({max(found):.2f})" if len(found) > 1 else ""
+    return f"{np.exp(np.mean(np.log(found))):.2f}{worst}"
 
 
 if __name__ == "__main__":
