@@ -57,6 +57,7 @@ class Settings:
     group: int = 1  # consecutive patches of a batch that show one exemplar
 
     # Optimisation
+    critic_contrast: float = 0.0  # D sees colours stretched until they deviate by so much (rms); 0: as they are
     critic_start: str = ""  # the embedded space whose critic D starts as, else N(0,1)
     critic_rate: float = 2e-3
     critic_rate_floor: float = 1e-3
@@ -109,6 +110,7 @@ class Budget:
 
 
 FAST = Settings(
+    critic_contrast=0.15,
     critic_start="stone",
     principal_colors=True,
     relative_gram=True,
@@ -147,6 +149,7 @@ PRESETS = {
         FAST,
         **SPACE,
         color_moments=True,
+        critic_contrast=0.0,
         penalty_every=1,
         sampler_rate=1e-3,
         sampler_half_life=6000.0,

@@ -22,6 +22,7 @@ from solidgrain.train.space import Space
 from solidgrain.train.space_run import SpaceRun
 
 PLACES = 4096  # at which an average is looked at
+FAINTEST = 1 / 255  # deviation of an exemplar that is all of one colour
 SHOWN = 4  # exemplars of a space in a sample, half of them held out
 
 
@@ -44,6 +45,10 @@ class Task(Protocol):
 
     def draw(self, generator: torch.Generator) -> Batch: ...
 
+    def stretched(self, images: Tensor) -> Tensor:
+        """Images [B, 3, H, W] as D is to see them."""
+        ...
+
     def probe(self) -> Probe: ...
 
     def shown(self) -> Sequence[tuple[Tensor, tuple[Tensor, ...]]]:
@@ -63,6 +68,9 @@ class SingleExemplar:
     def __init__(self, run: Run, device: torch.device) -> None:
         self.settings, self.device = run.settings, device
         self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
+        self.middle = self.exemplar.mean((1, 2))[:, None, None]
+        deviation = max(FAINTEST, float((self.exemplar - self.middle).square().mean().sqrt()))
+        self.gain = max(1.0, run.settings.critic_contrast / deviation)
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
         sampler = make_sampler(self.settings, generator)
@@ -74,6 +82,9 @@ class SingleExemplar:
     def draw(self, generator: torch.Generator) -> Batch:
         inputs = draw_noise(self.settings, generator), draw_slices(self.settings, generator)
         return Batch(inputs, exemplar.draw_patches(self.exemplar, self.settings, generator))
+
+    def stretched(self, images: Tensor) -> Tensor:
+        return images if self.gain == 1 else self.middle + self.gain * (images - self.middle)
 
     def probe(self) -> Probe:
         return Probe(_probe_inputs(self.settings, 1, self.device), [self.exemplar])
@@ -104,6 +115,9 @@ class TextureSpace:
         seen = [collection.draw_patches(one, settings.encoded_patch, 1, settings, generator) for one in chosen]
         real = [collection.draw_patches(one, settings.patch, settings.group, settings, generator) for one in chosen]
         return Batch((tables, points, torch.cat(seen)), torch.cat(real).contiguous(memory_format=torch.channels_last))
+
+    def stretched(self, images: Tensor) -> Tensor:
+        return images
 
     def probe(self) -> Probe:
         generator = torch.Generator(self.device).manual_seed(7)
