@@ -301,8 +301,9 @@ def adapt(
     began = time.monotonic()
     state = Adaptation(start, sampler, photograph, features, settings, recipe, device)
     descent, pace, ended, share = Descent(recipe, state.average.copy()), Pace(recipe.constant), "budget", 0.0
-    unadapted = state.average.copy()
+    unadapted, measuring = state.average.copy(), time.monotonic()
     first = state.measure(unadapted)
+    reserved = 2 * (time.monotonic() - measuring)  # for the two thetas that are measured at the end
     if not math.isfinite(first):
         raise TrainingError(f"texture {start.name!r}: its L_style is not a number; the critic or the bundle is damaged")
     while share < pace.ends_at:
@@ -314,7 +315,7 @@ def adapt(
             ended = "diverged"
             break
         seconds = time.monotonic() - began
-        share = budget.progress(state.iteration, seconds)
+        share = budget.progress(state.iteration, seconds + reserved)
         if descent.plateau and share < pace.falls_from:
             pace, ended = Pace(share), "plateau"
         on_report(Report(state.iteration, seconds, descent.mean))

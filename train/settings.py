@@ -113,6 +113,7 @@ FAST = Settings(
     critic_contrast=0.15,
     critic_start="stone",
     principal_colors=True,
+    pooled_gram=False,
     relative_gram=True,
     octave_rate=0.1,
 )
@@ -151,6 +152,7 @@ PRESETS = {
         color_moments=True,
         critic_contrast=0.0,
         penalty_every=1,
+        pooled_gram=True,
         sampler_rate=1e-3,
         sampler_half_life=6000.0,
         critic_half_life=6000.0,

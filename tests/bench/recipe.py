@@ -56,7 +56,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "random-rgb": ("both of these", as_paper("critic_start", "principal_colors")),
     "lazy": ("penalty every iteration", as_paper("penalty_every")),
     "gram": ("Gram differences as they are", as_paper("relative_gram")),
-    "pooled": ("Gram matrices patch by patch", as_paper("pooled_gram")),
+    "pooled": ("Gram matrices of the batch's mean", replace(FAST, pooled_gram=True)),
     "octave-rate": ("T_i as fast as the rest", as_paper("octave_rate")),
     "octave-span": ("octaves 2^i", as_paper("octave_span")),
     "orthogonal": ("T_i from N(0,1)", as_paper("orthogonal_start")),

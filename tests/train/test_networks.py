@@ -119,7 +119,8 @@ def test_style_loss_compares_exemplar_by_exemplar():
 
 
 def test_gram_matrices_are_averaged_over_the_patches_of_one_exemplar_and_never_over_two():
-    assert preset("fast", batch=6).gram_groups == 1
+    assert preset("fast", batch=6).gram_groups == 6
+    assert preset("fast", batch=6, pooled_gram=True).gram_groups == 1
     assert preset("fast space", batch=6, group=2).gram_groups == 3
     assert preset("paper", batch=6).gram_groups == preset("paper space", batch=6).gram_groups == 6
 
