@@ -25,6 +25,7 @@ from solidgrain.runtime.fold import read_weights
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.collection import LEVELS, Member, draw_patches, wraps
 from solidgrain.train.companion import Companion
+from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
 from solidgrain.train.loop import use_bfloat16
 from solidgrain.train.losses import gram_matrices
@@ -86,6 +87,7 @@ class Features(NamedTuple):
 
     activations: Callable[[Tensor], Sequence[Tensor]]  # images [B, 3, H, W] -> [B, C, h, w] of each layer
     relative: bool  # whether each layer's term is divided by the mean absolute entry of the photograph's Gram matrix
+    contrast: float = 0.0  # to which it sees faint photographs stretched
 
 
 class Theta(NamedTuple):
@@ -126,7 +128,8 @@ class FrozenSampler:
 def critic_features(companion: Companion, device: torch.device) -> Features:
     """F of L_style as in the paper: the activations of the space's own D, compared as they were in its training."""
     critic = companion.critic.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return Features(lambda images: critic(images)[1], companion.settings.relative_gram)
+    settings = companion.settings
+    return Features(lambda images: critic(images)[1], settings.relative_gram, settings.critic_contrast)
 
 
 def vgg_features(device: torch.device) -> Features:
@@ -165,6 +168,7 @@ class Adaptation:
         rates = (recipe.octave_rate, recipe.style_rate, recipe.style_rate, recipe.noise_rate)
         groups = [{"params": [part], "lr": rate, "start": rate} for part, rate in zip(self.theta, rates, strict=True)]
         self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
+        self.stretch = stretch_to(features.contrast, photograph, device)
         self.target = self._mean_grams(photograph)
         self.tables = torch.empty(0)
 
@@ -192,7 +196,7 @@ class Adaptation:
         with self._autocast():  # coordinates stay outside it: in bfloat16 they are wrong by texels
             rgb = self.sampler(noise, theta)
             images = rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
-            activations = self.features.activations(images)
+            activations = self.features.activations(self.stretch(images))
         terms = []
         for wanted, of_layer in zip(self.target, activations, strict=True):
             difference = (wanted - gram_matrices(of_layer, 1)).abs().mean()
@@ -208,7 +212,7 @@ class Adaptation:
         for _ in range(self.recipe.crops // self.settings.batch):
             crops = draw_patches(member, self.settings.patch, self.settings.batch, self.settings, self.generator)
             with self._autocast():
-                activations = self.features.activations(crops)
+                activations = self.features.activations(self.stretch(crops))
             batches.append([gram_matrices(of_layer, 1) for of_layer in activations])
         return [torch.stack(grams).mean(0) for grams in zip(*batches, strict=True)]
 

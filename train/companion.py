@@ -22,10 +22,18 @@ from solidgrain.runtime.bundle import CRITIC, Bundle, embedded_folder, open_bund
 from solidgrain.runtime.errors import BundleError
 from solidgrain.runtime.files import DAMAGED_ARCHIVE
 from solidgrain.train.critic import Critic
-from solidgrain.train.settings import FAST, Settings
+from solidgrain.train.settings import Settings
 
 FORMAT, FORMAT_VERSION = "solidgrain-critic", 1
-SEEN = ("patch", "batch", "transposed", "rotations", "grain", "relative_gram")  # the settings of what D sees and L_style asks
+SEEN = (
+    "patch",
+    "batch",
+    "transposed",
+    "rotations",
+    "grain",
+    "relative_gram",
+    "critic_contrast",
+)  # the settings of what D sees and L_style asks
 
 
 @dataclass(frozen=True)
@@ -76,9 +84,9 @@ def read_companion(path: Path, bundle: Bundle) -> Companion:
 
 
 def seen_settings(values: Any) -> Settings:
-    """Settings with those values that shape what D sees; the preset's where there are none."""
+    """Settings with those values that shape what D sees; the defaults where there are none."""
     known = values if isinstance(values, Mapping) else {}
-    return replace(FAST, **{name: known[name] for name in SEEN if name in known})
+    return replace(Settings(), **{name: known[name] for name in SEEN if name in known})
 
 
 def _critic(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> Critic:

@@ -64,7 +64,7 @@ class Trainer:
         settings, started = self.settings, time.monotonic()
         self._set_rates()
         batch = self.task.draw(self.generator)
-        fake, real = self.task.stretched(self.synthesise(batch)), self.task.stretched(batch.real)  # (B, 3, patch, patch)
+        fake, real = batch.stretch(self.synthesise(batch)), batch.stretch(batch.real)  # (B, 3, patch, patch)
         with self._autocast():  # once for both losses: "the activations in D are anyhow computed during GAN training"
             (on_fake, of_fake), (on_real, of_real) = self.judge(fake), self.judge(real)
 

@@ -57,7 +57,7 @@ class Settings:
     group: int = 1  # consecutive patches of a batch that show one exemplar
 
     # Optimisation
-    critic_contrast: float = 0.0  # D sees colours stretched until they deviate by so much (rms); 0: as they are
+    critic_contrast: float = 0.0  # root mean square to which D sees faint exemplars stretched; 0: as they are
     critic_start: str = ""  # the embedded space whose critic D starts as, else N(0,1)
     critic_rate: float = 2e-3
     critic_rate_floor: float = 1e-3

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from solidgrain.train import collection, exemplar
 from solidgrain.train.collection import Member
+from solidgrain.train.contrast import Stretch, stretch_to, together
 from solidgrain.train.noise import draw_tables
 from solidgrain.train.run import Run, RunFolder
 from solidgrain.train.sampler import make_sampler
@@ -22,7 +23,6 @@ from solidgrain.train.space import Space
 from solidgrain.train.space_run import SpaceRun
 
 PLACES = 4096  # at which an average is looked at
-FAINTEST = 1 / 255  # deviation of an exemplar that is all of one colour
 SHOWN = 4  # exemplars of a space in a sample, half of them held out
 
 
@@ -31,6 +31,7 @@ class Batch(NamedTuple):
 
     inputs: tuple[Tensor, ...]  # noise tables, points [B, patch², 3], and for a space the patches that E sees
     real: Tensor  # [B, 3, patch, patch]
+    stretch: Stretch  # what D sees of either
 
 
 class Probe(NamedTuple):
@@ -44,10 +45,6 @@ class Task(Protocol):
     def make_model(self, generator: torch.Generator) -> nn.Module: ...
 
     def draw(self, generator: torch.Generator) -> Batch: ...
-
-    def stretched(self, images: Tensor) -> Tensor:
-        """Images [B, 3, H, W] as D is to see them."""
-        ...
 
     def probe(self) -> Probe: ...
 
@@ -68,9 +65,7 @@ class SingleExemplar:
     def __init__(self, run: Run, device: torch.device) -> None:
         self.settings, self.device = run.settings, device
         self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
-        self.middle = self.exemplar.mean((1, 2))[:, None, None]
-        deviation = max(FAINTEST, float((self.exemplar - self.middle).square().mean().sqrt()))
-        self.gain = max(1.0, run.settings.critic_contrast / deviation)
+        self.stretch = stretch_to(run.settings.critic_contrast, run.exemplar, device)
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
         sampler = make_sampler(self.settings, generator)
@@ -81,10 +76,7 @@ class SingleExemplar:
 
     def draw(self, generator: torch.Generator) -> Batch:
         inputs = draw_noise(self.settings, generator), draw_slices(self.settings, generator)
-        return Batch(inputs, exemplar.draw_patches(self.exemplar, self.settings, generator))
-
-    def stretched(self, images: Tensor) -> Tensor:
-        return images if self.gain == 1 else self.middle + self.gain * (images - self.middle)
+        return Batch(inputs, exemplar.draw_patches(self.exemplar, self.settings, generator), self.stretch)
 
     def probe(self) -> Probe:
         return Probe(_probe_inputs(self.settings, 1, self.device), [self.exemplar])
@@ -99,6 +91,7 @@ class TextureSpace:
     def __init__(self, run: SpaceRun, device: torch.device) -> None:
         self.settings, self.device, self.run = run.settings, device, run
         self.members = run.trained_on
+        self.stretches = [stretch_to(run.settings.critic_contrast, member.exemplar, device) for member in self.members]
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
         space = Space(self.settings, generator)
@@ -111,13 +104,12 @@ class TextureSpace:
         settings, device = self.settings, self.device
         tables, points = draw_noise(settings, generator), draw_slices(settings, generator)
         order = torch.randperm(len(self.members), generator=generator, device=device).tolist()
-        chosen = [self.members[order[k % len(order)]] for k in range(settings.batch // settings.group)]
+        places = [order[k % len(order)] for k in range(settings.batch // settings.group)]
+        chosen = [self.members[place] for place in places]
         seen = [collection.draw_patches(one, settings.encoded_patch, 1, settings, generator) for one in chosen]
         real = [collection.draw_patches(one, settings.patch, settings.group, settings, generator) for one in chosen]
-        return Batch((tables, points, torch.cat(seen)), torch.cat(real).contiguous(memory_format=torch.channels_last))
-
-    def stretched(self, images: Tensor) -> Tensor:
-        return images
+        stretch = together([self.stretches[place] for place in places]).repeated(settings.group)
+        return Batch((tables, points, torch.cat(seen)), torch.cat(real).contiguous(memory_format=torch.channels_last), stretch)
 
     def probe(self) -> Probe:
         generator = torch.Generator(self.device).manual_seed(7)
