@@ -15,7 +15,7 @@ from solidgrain.export.sampler_graph import build_sampler_graph
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.texture_file import TextureData
-from solidgrain.train.colors import settle_colors
+from solidgrain.train.colors import settle_mean
 from solidgrain.train.run import Run, RunFolder, open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import to_json
@@ -44,7 +44,7 @@ def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = Fa
         average.load_state_dict(state["average"])
     except (RuntimeError, TypeError) as error:
         raise TrainingError(f"{run_folder}: the checkpoint does not fit the run's settings; start the run again") from error
-    settle_colors(average, run.exemplar)
+    settle_mean(average, run.exemplar)
     weights = sampler_weights(average)
     check_agreement(average, weights)
     training = provenance(run, state)

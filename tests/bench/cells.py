@@ -25,7 +25,7 @@ from solidgrain.runtime.errors import SolidgrainError, TrainingError, UsageError
 from solidgrain.runtime.files import replacing
 from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.provider import usable_threads
-from solidgrain.train.colors import settle_colors
+from solidgrain.train.colors import settle_mean
 from solidgrain.train.cuts import Sample
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
@@ -163,7 +163,7 @@ def sampling(run: RunFolder, device: torch.device, *conditions: Tensor) -> Sampl
     model = make_task(run, device).make_model(torch.Generator(device))
     model.load_state_dict(state["average"])
     if isinstance(run, Run):
-        settle_colors(model, run.exemplar)  # as an export does
+        settle_mean(model, run.exemplar)  # as an export does
     octaves = model.sampler if isinstance(model, Space) else model
     instance: dict[int, Tensor] = {}
 
