@@ -33,11 +33,18 @@ class Stretch(NamedTuple):
 
 def stretch_to(contrast: float, exemplar: FloatArray, device: torch.device) -> Stretch:
     """What brings an exemplar [H, W, 3] to a contrast; 0 for as it is."""
+    if not contrast:
+        return unstretched(device)
     pixels = torch.from_numpy(exemplar).reshape(-1, 3).double()
     middle = pixels.mean(0)
     deviation = max(FAINTEST, float((pixels - middle).square().mean().sqrt()))
     gain = torch.full((1, 1, 1, 1), max(1.0, contrast / deviation), device=device)
     return Stretch(middle.float().reshape(1, 3, 1, 1).to(device), gain)
+
+
+def unstretched(device: torch.device) -> Stretch:
+    """What leaves any exemplar as it is."""
+    return Stretch(torch.zeros(1, 3, 1, 1, device=device), torch.ones(1, 1, 1, 1, device=device))
 
 
 def together(stretches: Sequence[Stretch]) -> Stretch:

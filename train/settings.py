@@ -145,7 +145,8 @@ SPACE: dict[str, Any] = {"octaves": 32, "latent": 32}
 PRESETS = {
     "fast": FAST,
     "paper": PAPER,
-    # Rates fall more slowly than for one exemplar: hours of training, over many.
+    # Rates fall more slowly than for one exemplar: hours of training, over many. A critic that started from N(0,1) lost its
+    # slope when the penalty looked away.
     "fast space": replace(
         FAST,
         **SPACE,

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from solidgrain.train import collection, exemplar
 from solidgrain.train.collection import Member
-from solidgrain.train.contrast import Stretch, stretch_to, together
+from solidgrain.train.contrast import Stretch, stretch_to, together, unstretched
 from solidgrain.train.noise import draw_tables
 from solidgrain.train.run import Run, RunFolder
 from solidgrain.train.sampler import make_sampler
@@ -91,7 +91,10 @@ class TextureSpace:
     def __init__(self, run: SpaceRun, device: torch.device) -> None:
         self.settings, self.device, self.run = run.settings, device, run
         self.members = run.trained_on
-        self.stretches = [stretch_to(run.settings.critic_contrast, member.exemplar, device) for member in self.members]
+        contrast = run.settings.critic_contrast  # without one, no photograph is read for it: collections may be large
+        self.stretches = [
+            stretch_to(contrast, one.exemplar, device) if contrast else unstretched(device) for one in self.members
+        ]
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
         space = Space(self.settings, generator)

@@ -256,6 +256,13 @@ def test_flags_that_make_no_sense_are_refused_in_one_line(solidgrain, tmp_path, 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_photographs_of_a_space_are_not_reduced(solidgrain, tmp_path):
+    outcome = solidgrain("train", "--space", tmp_path, "--patch-scale", 2, "--out", tmp_path / "run")
+    assert outcome.code == 2
+    assert "--patch-scale: is about one photograph" in outcome.error
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_cuda_without_a_device_is_an_error_not_a_fall_back(solidgrain, tmp_path, photograph):
     outcome = solidgrain("train", photograph, "--out", tmp_path / "run", "--device", "cuda")
