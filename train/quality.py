@@ -154,12 +154,12 @@ def _gram_distance(exemplar: list[Tensor], other: list[Tensor]) -> float:
 
 
 def _projections(vectors: Tensor, count: int) -> Tensor:
-    """Vectors [N, d] on `count` fixed random directions, each projection sorted: [min(N, 20 000), count]."""
+    """Vectors [N, d] on `count` fixed random directions, each projection sorted: [count, min(N, 20 000)]."""
     generator = torch.Generator().manual_seed(1)
     directions = torch.randn(vectors.shape[1], count, generator=generator)
     chosen = torch.randperm(len(vectors), generator=generator)[:20000]
-    projected: Tensor = (vectors[chosen] @ (directions / directions.norm(dim=0))).sort(0).values
-    return projected
+    projected = (directions / directions.norm(dim=0)).T @ vectors[chosen].T
+    return torch.from_numpy(np.sort(projected.numpy()))  # ten times as fast as torch's, which also says where each was
 
 
 def _wasserstein(a: Tensor, b: Tensor) -> float:
