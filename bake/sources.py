@@ -13,7 +13,7 @@ import numpy.typing as npt
 from solidgrain.runtime import BakeError, ExemplarError, Space, Texture, UsageError, load_space
 from solidgrain.runtime.space import DEFAULT_SPACE
 from solidgrain.runtime.texture_file import read_texture
-from solidgrain.train.photograph import SUFFIXES, read_photograph  # the one module of training that a bake shares: no torch
+from solidgrain.train.photograph import SUFFIXES, read_photograph, scaled  # what a bake shares with training: no torch
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -142,18 +142,3 @@ def cut_patch(pixels: FloatArray, size: int, cut: Cut, name: str) -> tuple[Float
     advice = "; --patch-scale takes in more of it" if share < 0.25 and cut.scale is None else ""
     note = f"{name}: encodes {side}x{side} of {width}x{height} pixels {where}, {100 * share:.0f} % of the picture{advice}"
     return scaled(pixels[top : top + side, left : left + side], side / size), note
-
-
-def scaled(pixels: FloatArray, scale: float) -> FloatArray:
-    """A picture [H, W, 3] with `scale` of its pixels in one, averaged in linear light; sRGB-encoded as before."""
-    if scale == 1:
-        return np.ascontiguousarray(pixels)
-    import OpenImageIO as oiio
-
-    from solidgrain.bake.color import to_linear, to_srgb
-
-    height, width = (max(1, round(extent / scale)) for extent in pixels.shape[:2])
-    whole = oiio.ImageBuf(np.ascontiguousarray(to_linear(pixels)))
-    smaller = oiio.ImageBufAlgo.resize(whole, "box", 1.0, oiio.ROI(0, width, 0, height, 0, 1, 0, 3))
-    linear = np.asarray(smaller.get_pixels(oiio.FLOAT), np.float32)
-    return np.ascontiguousarray(to_srgb(linear).clip(0, 1))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from solidgrain.bake.sources import scaled
 from solidgrain.export.evaluation import scale_of
 from solidgrain.runtime.bundle import Bundle, embedded_folder, embedded_names, open_bundle
 from solidgrain.runtime.errors import ExemplarError
@@ -38,7 +37,7 @@ def find_photograph(bundle: Bundle, folder: Path) -> FloatArray | None:
     said = exemplar_of(bundle)
     paths = sorted(path for path in folder.rglob("*") if path.name == said["exemplar"])
     for path in paths:
-        pixels = scaled(read_exemplar(path, SMALLEST), scale_of(bundle))
+        pixels = read_exemplar(path, SMALLEST, scale_of(bundle))
         if pixels_sha256(pixels) == said["sha256"]:
             return pixels
     if paths:

@@ -30,7 +30,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from solidgrain.bake.sources import scaled
     from solidgrain.export.evaluation import grain_of, measure, scale_of, write_quality
     from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load_texture
@@ -43,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     inception = Inception(arguments.inception) if arguments.inception else None
     texture = load_texture(arguments.source, bundle=arguments.bundle, threads=arguments.threads)
     scale = arguments.patch_scale or scale_of(texture.bundle)
-    exemplar = scaled(read_exemplar(arguments.exemplar, round(SMALLEST * scale)), scale)
+    exemplar = read_exemplar(arguments.exemplar, SMALLEST, scale)
     print(f"measuring {2 * arguments.slices} slices of {texture.name}", file=sys.stderr)
     found = measure(texture, exemplar, arguments.slices, inception)
     figures = found.figures

@@ -112,8 +112,8 @@ def open_features(space: Space, arguments: argparse.Namespace, device: torch.dev
 
 def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData, FloatArray]:
     """What E and Q make of the photograph, and the pixels to adapt to: all of it, or with --crop what E sees."""
-    from solidgrain.bake.sources import Cut, cut_patch, scaled
-    from solidgrain.train.photograph import read_photograph
+    from solidgrain.bake.sources import Cut, cut_patch
+    from solidgrain.train.photograph import read_photograph, scaled
 
     photograph = read_photograph(arguments.photo, 1)
     if photograph.warning:

@@ -193,9 +193,8 @@ def held_out_names(text: str | None) -> int | list[str]:
 
 def start(arguments: argparse.Namespace) -> Run:
     """A new run directory for the photograph, with a warning if one texture cannot describe it."""
-    from solidgrain.bake.sources import scaled
     from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
-    from solidgrain.train.photograph import read_photograph
+    from solidgrain.train.photograph import read_photograph, scaled
     from solidgrain.train.run import Source, create_run
     from solidgrain.train.vgg import find_weights
 

@@ -29,9 +29,9 @@ class Photograph(NamedTuple):
     warning: str  # what the file declares of its colours that could not be honoured, or ""
 
 
-def read_exemplar(path: str | os.PathLike[str], smallest: int) -> FloatArray:
-    """The pixels of `read_photograph`."""
-    return read_photograph(path, smallest).pixels
+def read_exemplar(path: str | os.PathLike[str], smallest: int, scale: float = 1.0) -> FloatArray:
+    """The pixels of `read_photograph`, `scale` of them in one; `smallest` is what is left along an axis."""
+    return scaled(read_photograph(path, round(smallest * scale)).pixels, scale)
 
 
 def read_photograph(path: str | os.PathLike[str], smallest: int, advice: str = ADVICE) -> Photograph:
@@ -71,6 +71,21 @@ def read_photograph(path: str | os.PathLike[str], smallest: int, advice: str = A
     encoded = encode(rgb, spec)
     pixels = np.ascontiguousarray(encoded.rgb.clip(0.0, 1.0), np.float32)
     return Photograph(pixels, encoded.colorspace, encoded.warning)
+
+
+def scaled(pixels: FloatArray, scale: float) -> FloatArray:
+    """A picture [H, W, 3] with `scale` of its pixels in one, averaged in linear light; sRGB-encoded as before."""
+    if scale == 1:
+        return np.ascontiguousarray(pixels)
+    import OpenImageIO as oiio
+
+    from solidgrain.bake.color import to_linear, to_srgb
+
+    height, width = (max(1, round(extent / scale)) for extent in pixels.shape[:2])
+    whole = oiio.ImageBuf(np.ascontiguousarray(to_linear(pixels)))
+    smaller = oiio.ImageBufAlgo.resize(whole, "box", 1.0, oiio.ROI(0, width, 0, height, 0, 1, 0, 3))
+    linear = np.asarray(smaller.get_pixels(oiio.FLOAT), np.float32)
+    return np.ascontiguousarray(to_srgb(linear).clip(0, 1))
 
 
 def _check_size(path: Path, spec: oiio.ImageSpec, smallest: int, advice: str) -> None:

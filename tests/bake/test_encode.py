@@ -13,9 +13,10 @@ import OpenImageIO as oiio
 import pytest
 
 from solidgrain.bake.color import to_linear, to_srgb
-from solidgrain.bake.sources import Cut, cut_patch, scaled
+from solidgrain.bake.sources import Cut, cut_patch
 from solidgrain.runtime import BundleError, ExemplarError, load, load_space, load_texture
 from solidgrain.runtime.texture_file import read_texture
+from solidgrain.train.photograph import scaled
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,6 @@ import OpenImageIO as oiio
 import torch
 
 from solidgrain.bake.arguments import parse_count, parse_positive, parse_scale, parse_seconds
-from solidgrain.bake.sources import scaled
 from solidgrain.export.evaluation import grain_of
 from solidgrain.runtime import SolidgrainError, Space, UsageError, load_space
 from solidgrain.runtime.bundle import ENCODER, MAPPING, SAMPLER
@@ -63,8 +62,7 @@ class Subject:
     @cached_property
     def pixels(self) -> FloatArray:
         """All of it, at the scale that is encoded. Raises ExemplarError if it is unreadable or too small."""
-        smallest = max(SMALLEST, round(self.patch * self.scale))
-        return scaled(read_exemplar(self.path, smallest), self.scale)
+        return read_exemplar(self.path, max(SMALLEST, self.patch), self.scale)
 
     @property
     def encoded(self) -> FloatArray:
