@@ -51,8 +51,8 @@ class Trainer:
         self.judge = make_judge(self.settings, self.critic, device)
         self.sampler = self.task.make_model(self.generator)
         self.average = copy.deepcopy(self.sampler).requires_grad_(False)
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), betas=(0.5, 0.999))
-        self.sampler_optimiser = torch.optim.Adam(parameter_groups(self.sampler, self.settings), betas=(0.5, 0.999))
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), betas=(0.5, 0.999), fused=True)
+        self.sampler_optimiser = torch.optim.Adam(parameter_groups(self.sampler, self.settings), betas=(0.5, 0.999), fused=True)
         self.reduced_precision = use_bfloat16(self.settings, device)
         self.iteration, self.seconds = 0, 0.0
         self.watch, self.setbacks = Watch(), 0
