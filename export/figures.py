@@ -27,13 +27,15 @@ class Figures:
 
 def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
     rows = []
+    column = ("exemplar turned by 90°",) if evaluation.turned else ()  # what earlier versions found has none
     for name, floor in evaluation.floor.items():
         spreads = (evaluation.axis[name], evaluation.oblique[name])
-        rows.append((name, f"{floor:.4g}", *(f"{mean:.2f} ± {deviation:.2f}" for mean, deviation in spreads)))
+        turned = (f"{evaluation.turned[name]:.2f}" for _ in column)
+        rows.append((name, f"{floor:.4g}", *turned, *(f"{mean:.2f} ± {deviation:.2f}" for mean, deviation in spreads)))
     return Figures(
         f"Distances to the exemplar over its own floor, mean ± standard deviation over {evaluation.slices} slices of "
         f"{evaluation.crop}² pixels, through the runtime:",
-        ("measure", "floor", "axis-aligned slices", "oblique slices"),
+        ("measure", "floor", *column, "axis-aligned slices", "oblique slices"),
         rows,
         f"Copying: patches are {copying.ratio:.2f} times as far from the exemplar as its halves are from each other, and "
         f"{100 * copying.closer:.1f} % of {copying.patches} come nearer than 99 % of those do "

@@ -16,7 +16,7 @@ Images here are tensors [1, 3, H, W] in [0, 1].
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -44,6 +44,7 @@ class Evaluation:
     floor: Measures
     axis: dict[str, tuple[float, float]]
     oblique: dict[str, tuple[float, float]]
+    turned: Measures = field(default_factory=dict)  # the exemplar itself, turned by 90°: far above 1 where it has a direction
 
 
 @torch.no_grad()
@@ -57,9 +58,12 @@ def evaluate(
     measure = Measure(inception)
     image = as_image(exemplar)
     size = min(image.shape[2] // 2, image.shape[3] // 2, LARGEST_CROP)
-    crops = [measure.statistics(crop) for crop in disjoint_crops(image, size)]
+    squares = disjoint_crops(image, size)
+    crops = [measure.statistics(square) for square in squares]
     pairs = [(a, b) for i, a in enumerate(crops) for b in crops[:i]]
     floor = _mean(measure.distances(a, b) for a, b in pairs[:15])
+    quarter = [measure.statistics(square.rot90(1, (2, 3))) for square in squares[:4]]
+    turned = _mean(measure.distances(a, b) for i, a in enumerate(crops[:4]) for j, b in enumerate(quarter) if i != j)
 
     def ratios(rotation_of: Callable[[int, torch.Generator], Tensor]) -> dict[str, tuple[float, float]]:
         measured = []
@@ -76,6 +80,7 @@ def evaluate(
         floor=floor,
         axis=ratios(lambda seed, generator: axis_rotation(seed, grain)),
         oblique=ratios(lambda seed, generator: oblique_rotation(generator, grain)),
+        turned={name: turned[name] / floor[name] for name in floor},
     )
 
 

@@ -101,7 +101,8 @@ def check_figures(root: Path, name: str) -> None:
         axis, oblique = (
             f"{mean:.2f} ± {spread:.2f}" for mean, spread in (figures["axis"][measure], figures["oblique"][measure])
         )
-        row = f"| {measure} | {floor:.4g} | {axis} | {oblique} |"
+        turned = f"{figures['turned'][measure]:.2f} | " if figures["turned"] else ""
+        row = f"| {measure} | {floor:.4g} | {turned}{axis} | {oblique} |"
         assert row in section(root, name)
         assert row in card
     assert f"{figures['copying']['ratio']:.2f} times as far" in section(root, name)

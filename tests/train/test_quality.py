@@ -38,6 +38,15 @@ def test_exemplars_of_any_size_are_measured(side):
     assert all(np.isfinite(floor) for floor in evaluation.floor.values())
 
 
+def test_an_exemplar_with_a_direction_is_far_from_itself_turned():
+    even = evaluate(blotches(160, 160), resampled, slices=1).turned
+    streaks = np.repeat(blotches(160, 160)[:, :20], 8, axis=1)
+    lying = evaluate(streaks, lambda points, seed: np.resize(streaks, (len(points), 3)), slices=1).turned
+    assert even.keys() == lying.keys()
+    assert 0.5 < even["gram"] < 1.5
+    assert lying["vgg_frechet"] > 2 * even["vgg_frechet"]
+
+
 def test_white_noise_scores_far_above_one():
     evaluation = evaluate(
         EXEMPLAR, lambda points, seed: np.random.default_rng(seed).random((len(points), 3), np.float32), slices=2
