@@ -61,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--iterations", type=parse_positive, metavar="N", help="stop after N iterations in all")
     add("--minutes", type=parse_minutes, metavar="M", help="stop after M minutes of training in all")
+    add("--until-plateau", action="store_true", help="stop before, when slices come no nearer to the exemplar")
     add(
         "--anisotropic",
         nargs="?",
@@ -113,20 +114,21 @@ def train_together(arguments: argparse.Namespace, device: torch.device, processe
     stop = StopRequest(quiet=not processes.first)
     progress = Progress(training.budget, arguments.quiet)
     with processes.errors_once():
-        train(training, training.budget, device, progress.show, stop.requested, progress.warn, processes)
+        report = train(training, training.budget, device, progress.show, stop.requested, progress.warn, processes)
     stopped = processes.any(stop.requested())
     if processes.first:
-        print(how_to_go_on(training, stopped), file=sys.stderr)
+        print(how_to_go_on(training, stopped, report.iteration if report else 0), file=sys.stderr)
     return INTERRUPTED if stopped else 0
 
 
-def how_to_go_on(training: RunFolder, stopped: bool) -> str:
+def how_to_go_on(training: RunFolder, stopped: bool, iterations: int) -> str:
     folder = training.folder
+    done = f"done after {iterations} iterations" if training.budget.until_plateau else "done"
     if stopped:
         return f"stopped and saved; go on with: solidgrain train --resume {folder}"
     if training.settings.noise_at_input:
-        return f"{folder}: done; its slices are in {folder / 'samples'}; a bundle cannot hold noise at the input"
-    return f"{folder}: done; next: solidgrain export {folder} --out BUNDLE"
+        return f"{folder}: {done}; its slices are in {folder / 'samples'}; a bundle cannot hold noise at the input"
+    return f"{folder}: {done}; next: solidgrain export {folder} --out BUNDLE"
 
 
 def begin(arguments: argparse.Namespace, device: torch.device, first: bool) -> RunFolder:
@@ -254,26 +256,28 @@ def with_grain(settings: Settings, anisotropic: str | None, exemplar: Any) -> Se
 
 
 def resume(arguments: argparse.Namespace) -> RunFolder:
-    """The run to go on with, under its own settings; --iterations and --minutes replace its budget."""
+    """The run to go on with, under its own settings; --iterations, --minutes and --until-plateau replace its budget."""
     if arguments.exemplar is not None:
         raise UsageError(f"--resume {arguments.resume}: the run has its exemplar already; leave {arguments.exemplar} out")
     if given := [f"--{name.replace('_', '-')}" for name in FIXED if getattr(arguments, name) is not None]:
         raise UsageError(f"--resume {arguments.resume}: the run has settled {', '.join(given)} already; leave them out")
     training = open_any(arguments.resume)
-    if arguments.iterations is None and arguments.minutes is None:
+    if arguments.iterations is None and arguments.minutes is None and not arguments.until_plateau:
         return training
     return replace(training, budget=make_budget(arguments, training.settings))
 
 
 def make_budget(arguments: argparse.Namespace, settings: Settings) -> Budget:
-    """How long to train: what the flags say, or the preset's iterations."""
+    """How long to train: what the flags say, or the preset's iterations. Raises UsageError for a space with a plateau."""
     from solidgrain.train.settings import PRESET_ITERATIONS, Budget
 
     preset_name = settings.preset + (" space" if settings.latent else "")
 
+    if arguments.until_plateau and settings.latent:
+        raise UsageError("--until-plateau: is about a single exemplar; give a --space its --iterations or --minutes")
     if arguments.iterations is None and arguments.minutes is None:
-        return Budget(iterations=PRESET_ITERATIONS[preset_name])
-    return Budget(arguments.iterations, arguments.minutes)
+        return Budget(PRESET_ITERATIONS[preset_name], until_plateau=arguments.until_plateau)
+    return Budget(arguments.iterations, arguments.minutes, arguments.until_plateau)
 
 
 def choose_device(name: str) -> torch.device:

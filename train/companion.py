@@ -57,8 +57,13 @@ def first_critic(settings: Settings, generator: torch.Generator) -> Critic:
     """D when a training begins: random, or what it has learned beside an embedded space. Raises BundleError if that is gone."""
     if not settings.critic_start:
         return Critic(generator)
-    bundle = open_bundle(embedded_folder(settings.critic_start))
-    return read_companion(find_companion(bundle, None), bundle).critic.requires_grad_(True).to(generator.device)
+    return embedded_critic(settings.critic_start, generator.device).requires_grad_(True)
+
+
+def embedded_critic(name: str, device: torch.device) -> Critic:
+    """What D has learned beside an embedded space; it learns no more. Raises BundleError if it is gone."""
+    bundle = open_bundle(embedded_folder(name))
+    return read_companion(find_companion(bundle, None), bundle).critic.to(device)
 
 
 def read_companion(path: Path, bundle: Bundle) -> Companion:

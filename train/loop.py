@@ -16,9 +16,10 @@ from torch import Tensor, nn
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.train.companion import first_critic
 from solidgrain.train.losses import gradient_penalty, make_judge, style_loss
+from solidgrain.train.plateau import EVERY, Onlooker, Plateau
 from solidgrain.train.preview import write_preview
 from solidgrain.train.processes import Processes
-from solidgrain.train.run import CHECKPOINT, PARTS, RunFolder
+from solidgrain.train.run import CHECKPOINT, PARTS, Run, RunFolder
 from solidgrain.train.settings import Budget, Settings, rate
 from solidgrain.train.task import Batch, make_task
 from solidgrain.train.watch import Watch, flaw
@@ -55,7 +56,7 @@ class Trainer:
         self.sampler_optimiser = torch.optim.Adam(parameter_groups(self.sampler, self.settings), betas=(0.5, 0.999), fused=True)
         self.reduced_precision = use_bfloat16(self.settings, device)
         self.iteration, self.seconds = 0, 0.0
-        self.watch, self.setbacks = Watch(), 0
+        self.watch, self.plateau, self.setbacks = Watch(), Plateau(), 0
         if processes.rank:
             self._draw_anew(processes.rank)  # the same networks everywhere, batches of one's own
 
@@ -141,7 +142,7 @@ class Trainer:
     def save(self) -> None:
         parts = {name: getattr(self, name).state_dict() for name in PARTS}
         progress = {"iteration": self.iteration, "seconds": self.seconds}
-        caution = {"watch": self.watch.state(), "setbacks": self.setbacks}
+        caution = {"watch": self.watch.state(), "plateau": self.plateau.state(), "setbacks": self.setbacks}
         streams = self.processes.gathered(self.generator.get_state())
         if self.processes.first:
             random = {"generator": streams[0], "other_generators": streams[1:]}
@@ -158,6 +159,7 @@ class Trainer:
                 getattr(self, name).load_state_dict(state[name])
             self.generator.set_state(self._stream(state))
             self.watch = Watch(**state.get("watch", {}))  # runs of earlier versions have none
+            self.plateau = Plateau(**state.get("plateau", {}))
         except (RuntimeError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0]
             raise TrainingError(f"{self.run.folder}: the checkpoint does not fit the run or --device ({reason})") from error
@@ -221,9 +223,10 @@ def train(
     on_warning: Callable[[str], None] = lambda line: None,
     processes: Processes = ALONE,
 ) -> Report | None:
-    """Train until the budget is spent or `should_stop` says so, from the run's last checkpoint if there is one.
+    """Train until the budget is spent, a plateau that it asks for is reached, or `should_stop` says so; from the run's last
+    checkpoint if there is one.
 
-    Leaves a checkpoint and a sample behind in either case. A training that diverges (`watch`) goes back to its last
+    Leaves a checkpoint and a sample behind in any case. A training that diverges (`watch`) goes back to its last
     checkpoint, twice at most, and `on_warning` is told; then it raises TrainingError. No checkpoint is ever replaced by a
     state that is in doubt. Of several `processes`, all call this, and the first alone writes, reports and warns.
     """
@@ -232,8 +235,11 @@ def train(
     if processes.first:
         run.rewind_stats(trainer.iteration)
     settings, report = run.settings, None
+    onlooker = Onlooker(settings, run.exemplar, device) if budget.until_plateau and isinstance(run, Run) else None
 
     while not budget.done(trainer.iteration, trainer.seconds) and not processes.any(should_stop()):
+        if onlooker and processes.any(trainer.plateau.reached(trainer.iteration)):
+            break
         report = trainer.step()
         due = trainer.iteration % settings.checkpoint_every == 0
         style = report.style if settings.beta else 0.0  # where no one minimises it, it may grow as it likes
@@ -251,6 +257,8 @@ def train(
             on_report(report)
         if trainer.iteration % settings.sample_every == 0 and processes.first:
             _write_sample(trainer)
+        if onlooker and trainer.iteration % EVERY == 0:
+            trainer.plateau.see(onlooker.distance(trainer.average), trainer.iteration)
         if due and not trainer.watch.doubt():
             trainer.save()
     doubt = trainer.watch.doubt() or trainer.flaw()

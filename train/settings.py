@@ -94,10 +94,14 @@ class Settings:
 
 @dataclass(frozen=True)
 class Budget:
-    """When to stop: after that many iterations or minutes of training in all, whichever comes first."""
+    """When to stop: after that many iterations or minutes of training in all, whichever comes first.
+
+    Or before, when it gets no better (plateau.py).
+    """
 
     iterations: int | None = None
     minutes: float | None = None
+    until_plateau: bool = False
 
     def done(self, iteration: int, seconds: float) -> bool:
         return self.progress(iteration, seconds) >= 1.0

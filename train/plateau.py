@@ -1,0 +1,79 @@
+"""When a training no longer gets better, told by a critic that no longer learns.
+
+Neither loss says so: both are measured by a D that moves. The embedded space's critic stands still. Every `EVERY` iterations it
+looks at slices of the moving average, and their mean Gram matrices are compared with those of the exemplar's crops. The
+distance falls as a training gets better; when it has not fallen for half as long as it took to get there, that is a
+plateau. The paper trains for a fixed number of iterations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from solidgrain.train import exemplar
+from solidgrain.train.companion import embedded_critic
+from solidgrain.train.contrast import stretch_to
+from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.losses import gram_matrices
+from solidgrain.train.noise import draw_tables
+from solidgrain.train.settings import FAST, Settings
+from solidgrain.train.slices import draw_slices
+
+EVERY = 50  # iterations
+BATCHES = 8  # of slices, the same ones each time
+GAIN = 0.02  # by which a distance must undercut the lowest before it
+SHARE = 0.5  # of the iterations until the lowest, that may pass without another
+LEAST = 200  # of them in any case
+
+
+@dataclass
+class Plateau:
+    """The lowest distance so far; goes into the checkpoint."""
+
+    lowest: float = math.inf
+    at: int = 0  # iteration
+
+    def see(self, distance: float, iteration: int) -> None:
+        if distance < (1 - GAIN) * self.lowest:
+            self.lowest, self.at = distance, iteration
+
+    def reached(self, iteration: int) -> bool:
+        return iteration - self.at >= max(LEAST, SHARE * self.at)
+
+    def state(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class Onlooker:
+    """The critic that stands still, and what it has seen of the exemplar [H, W, 3]."""
+
+    def __init__(self, settings: Settings, pixels: FloatArray, device: torch.device) -> None:
+        self.settings, self.device = settings, device
+        self.critic = embedded_critic(FAST.critic_start, device)
+        self.stretch = stretch_to(FAST.critic_contrast, pixels, device)
+        image, generator = torch.from_numpy(pixels).permute(2, 0, 1).to(device), self._stream()
+        self.wanted = self._mean_grams([exemplar.draw_patches(image, settings, generator) for _ in range(2 * BATCHES)])
+
+    @torch.no_grad()
+    def distance(self, average: nn.Module) -> float:
+        """The mean over layers of the relative difference of Gram matrices."""
+        settings, generator, images = self.settings, self._stream(), []
+        for _ in range(BATCHES):
+            tables = draw_tables(settings.octaves, settings.resolution, generator)
+            rgb = average(tables, draw_slices(settings, generator))
+            images.append(rgb.reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2))
+        pairs = zip(self.wanted, self._mean_grams(images), strict=True)
+        return float(torch.stack([(wanted - found).abs().mean() / wanted.abs().mean() for wanted, found in pairs]).mean())
+
+    @torch.no_grad()
+    def _mean_grams(self, batches: list[Tensor]) -> list[Tensor]:
+        of_batches = [[gram_matrices(of_layer, 1)[0] for of_layer in self.critic(self.stretch(one))[1]] for one in batches]
+        return [torch.stack(of_layer).mean(0) for of_layer in zip(*of_batches, strict=True)]
+
+    def _stream(self) -> torch.Generator:
+        return torch.Generator(self.device).manual_seed(11)
