@@ -33,6 +33,7 @@ class Settings:
     # Slices (Sec. 4, implementation details)
     patch: int = 64  # pixels along each side of a patch
     batch: int = 4
+    strides: tuple[int, ...] = (1,)  # pixels between neighbouring samples of a patch, for the patches of a batch in turn
     transposed: bool = True  # real patches of isotropic materials are also transposed by chance, not only flipped
     # uniform on SO(3), the authors' three angles in [0°, 90°], or along the axes only (Henzler et al. 2020)
     rotations: Literal["uniform", "euler", "axis"] = "uniform"
@@ -114,6 +115,7 @@ class Budget:
 
 
 FAST = Settings(
+    strides=(1, 1, 2, 4),
     critic_contrast=0.15,
     critic_start="stone",
     principal_colors=True,
@@ -149,14 +151,12 @@ SPACE: dict[str, Any] = {"octaves": 32, "latent": 32}
 PRESETS = {
     "fast": FAST,
     "paper": PAPER,
-    # Rates fall more slowly than for one exemplar: hours of training, over many. A critic that started from N(0,1) lost its
-    # slope when the penalty looked away.
+    # Rates fall more slowly than for one exemplar: hours of training, over many.
     "fast space": replace(
         FAST,
         **SPACE,
+        strides=(1,),
         color_moments=True,
-        critic_contrast=0.0,
-        penalty_every=1,
         pooled_gram=True,
         sampler_rate=1e-3,
         sampler_half_life=6000.0,
@@ -186,4 +186,6 @@ def from_json(values: dict[str, Any]) -> Settings:
     unknown = set(values) - {field.name for field in fields(Settings)}
     if unknown:
         raise TrainingError(f"options.json: unknown settings {json.dumps(sorted(unknown))}; written by another version?")
+    if "strides" in values:
+        values = values | {"strides": tuple(values["strides"])}  # JSON has lists only
     return Settings(**values)
