@@ -160,7 +160,8 @@ def test_a_plateau_ends_it_early_and_slowly(run):
 def test_a_budget_of_seconds_ends_it(run):
     found = run(budget=Budget(minutes=0.5 / 60))
     assert found.ended == "budget"
-    assert 0.5 < found.seconds < 30
+    assert found.iterations >= 1
+    assert 0.25 < found.seconds < 30  # what is reserved for the last measuring may be left
 
 
 def test_nan_ends_it_with_the_best_before(run, companion):
