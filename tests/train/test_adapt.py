@@ -158,10 +158,10 @@ def test_a_plateau_ends_it_early_and_slowly(run):
 
 
 def test_a_budget_of_seconds_ends_it(run):
+    run(1)  # what is reserved for the last measuring is as long as the first one took: slow, if it were the process's first
     found = run(budget=Budget(minutes=0.5 / 60))
     assert found.ended == "budget"
-    assert found.iterations >= 1
-    assert 0.25 < found.seconds < 30  # what is reserved for the last measuring may be left
+    assert 0.5 < found.seconds < 30
 
 
 def test_nan_ends_it_with_the_best_before(run, companion):
