@@ -28,7 +28,7 @@ from solidgrain.train.companion import Companion
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
 from solidgrain.train.loop import use_bfloat16
-from solidgrain.train.losses import gram_matrices
+from solidgrain.train.losses import gram_difference, gram_matrices, mean_grams
 from solidgrain.train.noise import draw_tables, look_up
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, draw_slices
@@ -197,10 +197,8 @@ class Adaptation:
             rgb = self.sampler(noise, theta)
             images = rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
             activations = self.features.activations(self.stretch(images))
-        terms = []
-        for wanted, of_layer in zip(self.target, activations, strict=True):
-            difference = (wanted - gram_matrices(of_layer, 1)).abs().mean()
-            terms.append(difference / wanted.abs().mean() if self.features.relative else difference)
+        pairs = zip(self.target, activations, strict=True)
+        terms = [gram_difference(wanted, gram_matrices(of_layer, 1), self.features.relative) for wanted, of_layer in pairs]
         return torch.stack(terms).mean()
 
     @torch.no_grad()
@@ -208,13 +206,13 @@ class Adaptation:
         """What L_style compares with: since F is fixed, crops of the photograph need to be looked at only once."""
         pixels = np.round(photograph * LEVELS).astype(np.uint16)
         member = Member("", pixels, wraps(photograph))
-        batches = []
-        for _ in range(self.recipe.crops // self.settings.batch):
+
+        def look() -> Sequence[Tensor]:
             crops = draw_patches(member, self.settings.patch, self.settings.batch, self.settings, self.generator)
             with self._autocast():
-                activations = self.features.activations(self.stretch(crops))
-            batches.append([gram_matrices(of_layer, 1) for of_layer in activations])
-        return [torch.stack(grams).mean(0) for grams in zip(*batches, strict=True)]
+                return self.features.activations(self.stretch(crops))
+
+        return mean_grams(look() for _ in range(self.recipe.crops // self.settings.batch))
 
     @torch.no_grad()
     def measure(self, theta: Theta) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -51,10 +51,20 @@ def style_loss(real: Sequence[Tensor], fake: Sequence[Tensor], groups: int, rela
     """
     terms = []
     for of_real, of_fake in zip(real, fake, strict=True):
-        wanted, found = gram_matrices(of_real, groups), gram_matrices(of_fake, groups)
-        difference = (wanted - found).abs().mean((1, 2))
-        terms.append((difference / wanted.abs().mean((1, 2)) if relative else difference).mean())
+        terms.append(gram_difference(gram_matrices(of_real, groups), gram_matrices(of_fake, groups), relative).mean())
     return torch.stack(terms).mean()
+
+
+def gram_difference(wanted: Tensor, found: Tensor, relative: bool) -> Tensor:
+    """Mean absolute differences [groups] of Gram matrices [groups, C, C], over those wanted if `relative`."""
+    difference = (wanted - found).abs().mean((1, 2))
+    return difference / wanted.abs().mean((1, 2)) if relative else difference
+
+
+def mean_grams(batches: Iterable[Sequence[Tensor]]) -> list[Tensor]:
+    """The activations of several batches, by layer -> each layer's mean Gram matrix [1, C, C]."""
+    of_batches = [[gram_matrices(of_layer, 1) for of_layer in activations] for activations in batches]
+    return [torch.stack(of_layer).mean(0) for of_layer in zip(*of_batches, strict=True)]
 
 
 def gram_matrices(activations: Tensor, groups: int) -> Tensor:

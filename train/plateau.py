@@ -19,7 +19,7 @@ from solidgrain.train import exemplar
 from solidgrain.train.companion import embedded_critic
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.exemplar import FloatArray
-from solidgrain.train.losses import gram_matrices
+from solidgrain.train.losses import gram_difference, mean_grams
 from solidgrain.train.noise import draw_tables
 from solidgrain.train.settings import FAST, Settings
 from solidgrain.train.slices import draw_slices
@@ -68,12 +68,11 @@ class Onlooker:
             rgb = average(tables, draw_slices(settings, generator))
             images.append(rgb.reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2))
         pairs = zip(self.wanted, self._mean_grams(images), strict=True)
-        return float(torch.stack([(wanted - found).abs().mean() / wanted.abs().mean() for wanted, found in pairs]).mean())
+        return float(torch.stack([gram_difference(wanted, found, relative=True) for wanted, found in pairs]).mean())
 
     @torch.no_grad()
     def _mean_grams(self, batches: list[Tensor]) -> list[Tensor]:
-        of_batches = [[gram_matrices(of_layer, 1)[0] for of_layer in self.critic(self.stretch(one))[1]] for one in batches]
-        return [torch.stack(of_layer).mean(0) for of_layer in zip(*of_batches, strict=True)]
+        return mean_grams(self.critic(self.stretch(images))[1] for images in batches)
 
     def _stream(self) -> torch.Generator:
         return torch.Generator(self.device).manual_seed(11)
