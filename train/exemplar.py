@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -11,18 +10,10 @@ import torch
 from torch import Tensor
 
 from solidgrain.train.settings import Settings
-from solidgrain.train.slices import batch_strides
 
 FloatArray = npt.NDArray[np.float32]
 
-ROOM = 1.5  # of an exemplar's side over a crop's, at least
 NONSTATIONARY = 0.3  # above it, one texture cannot describe the image (docs/training.md)
-
-
-def fit_strides(settings: Settings, height: int, width: int) -> Settings:
-    """The settings with no stride at which a crop of the exemplar would have hardly a place to choose."""
-    largest = max(1, int(min(height, width) / (ROOM * settings.patch)))
-    return replace(settings, strides=tuple(min(stride, largest) for stride in settings.strides))
 
 
 def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:
@@ -30,12 +21,10 @@ def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generato
 
     An isotropic material looks the same turned by 90°, so its crops are also transposed by chance.
     """
-    patches = []
-    for stride in batch_strides(settings):
-        size = settings.patch * stride
+    size, patches = settings.patch, []
+    for _ in range(settings.batch):
         top, left = (uniform_below(extent - size + 1, generator) for extent in exemplar.shape[1:])
-        crop = exemplar[:, top : top + size : stride, left : left + size : stride]
-        patches.append(flip_by_chance(crop, settings, generator))
+        patches.append(flip_by_chance(exemplar[:, top : top + size, left : left + size], settings, generator))
     return torch.stack(patches).contiguous(memory_format=torch.channels_last)
 
 

@@ -53,11 +53,11 @@ class Onlooker:
     """The critic that stands still, and what it has seen of the exemplar [H, W, 3]."""
 
     def __init__(self, settings: Settings, pixels: FloatArray, device: torch.device) -> None:
-        self.settings, self.device = exemplar.fit_strides(settings, *pixels.shape[:2]), device
+        self.settings, self.device = settings, device
         self.critic = embedded_critic(FAST.critic_start, device)
         self.stretch = stretch_to(FAST.critic_contrast, pixels, device)
         image, generator = torch.from_numpy(pixels).permute(2, 0, 1).to(device), self._stream()
-        self.wanted = self._mean_grams([exemplar.draw_patches(image, self.settings, generator) for _ in range(2 * BATCHES)])
+        self.wanted = self._mean_grams([exemplar.draw_patches(image, settings, generator) for _ in range(2 * BATCHES)])
 
     @torch.no_grad()
     def distance(self, average: nn.Module) -> float:

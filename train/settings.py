@@ -33,7 +33,6 @@ class Settings:
     # Slices (Sec. 4, implementation details)
     patch: int = 64  # pixels along each side of a patch
     batch: int = 4
-    strides: tuple[int, ...] = (1,)  # pixels between neighbouring samples of a patch, for the patches of a batch in turn
     transposed: bool = True  # real patches of isotropic materials are also transposed by chance, not only flipped
     # uniform on SO(3), the authors' three angles in [0°, 90°], or along the axes only (Henzler et al. 2020)
     rotations: Literal["uniform", "euler", "axis"] = "uniform"
@@ -47,7 +46,7 @@ class Settings:
     penalty: float = 10.0  # lambda, weight of the gradient penalty
     penalty_every: int = 4  # iterations between penalties, each weighted that much more (lazy regularisation, StyleGAN2)
     drift: float = 0.001  # weight of E[D(r)^2] (gramgan/main.py; not in the paper)
-    pooled_gram: bool = True  # compare the mean Gram matrices of all patches of an exemplar, else patch by patch
+    pooled_gram: bool = False  # compare the mean Gram matrices of all patches of an exemplar, else patch by patch
 
     relative_gram: bool = False  # differences of Gram matrices over their size, else as they are
 
@@ -60,9 +59,9 @@ class Settings:
     # Optimisation
     critic_contrast: float = 0.0  # root mean square to which D sees faint exemplars stretched; 0: as they are
     critic_start: str = ""  # the embedded space whose critic D starts as, else N(0,1)
-    critic_rate: float = 2e-3
+    critic_rate: float = 1e-3
     critic_rate_floor: float = 1e-3
-    critic_half_life: float = 1000.0
+    critic_half_life: float = 0.0
     sampler_rate: float = 2e-3
     sampler_rate_floor: float = 4e-4
     sampler_half_life: float = 400.0
@@ -115,11 +114,9 @@ class Budget:
 
 
 FAST = Settings(
-    strides=(1, 1, 2, 4),
     critic_contrast=0.15,
     critic_start="stone",
     principal_colors=True,
-    pooled_gram=False,
     relative_gram=True,
     octave_rate=0.1,
 )
@@ -135,9 +132,8 @@ PAPER = Settings(
     transposed=False,
     rotations="euler",
     penalty_every=1,
-    pooled_gram=False,
+    critic_rate=2e-3,
     critic_rate_floor=2e-3,
-    critic_half_life=0.0,
     sampler_rate=5e-4,
     sampler_rate_floor=5e-4,
     sampler_half_life=0.0,
@@ -155,11 +151,11 @@ PRESETS = {
     "fast space": replace(
         FAST,
         **SPACE,
-        strides=(1,),
         color_moments=True,
         pooled_gram=True,
         sampler_rate=1e-3,
         sampler_half_life=6000.0,
+        critic_rate=2e-3,
         critic_half_life=6000.0,
     ),
     "paper space": replace(PAPER, **SPACE, octave_span=15.5),  # 2^(i/2)
@@ -186,6 +182,4 @@ def from_json(values: dict[str, Any]) -> Settings:
     unknown = set(values) - {field.name for field in fields(Settings)}
     if unknown:
         raise TrainingError(f"options.json: unknown settings {json.dumps(sorted(unknown))}; written by another version?")
-    if "strides" in values:
-        values = values | {"strides": tuple(values["strides"])}  # JSON has lists only
     return Settings(**values)

@@ -18,18 +18,8 @@ def draw_slices(settings: Settings, generator: torch.Generator) -> Tensor:
     flat = flat_slice(settings.patch, generator.device)
     centred = flat - settings.patch / (2 * UNIT) * torch.tensor([1.0, 1.0, 0.0], device=flat.device)
     turned = torch.einsum("bij,pj->bpi", draw_rotations(settings, generator), centred)
-    turned = turned * torch.tensor(batch_strides(settings), device=flat.device)[:, None, None]
     shift = torch.rand(settings.batch, 1, 3, generator=generator, device=generator.device)
     return turned + (2 * shift - 1)
-
-
-def batch_strides(settings: Settings) -> list[int]:
-    """The stride of each patch of a batch, in pixels.
-
-    A coarse patch is sampled, not averaged, and so is the photograph's: both show the same larger piece of the material with
-    the same aliasing, and cost what any patch costs.
-    """
-    return [settings.strides[k % len(settings.strides)] for k in range(settings.batch)]
 
 
 def flat_slice(size: int, device: torch.device) -> Tensor:

@@ -63,7 +63,7 @@ class SingleExemplar:
     """Sec. 3.1."""
 
     def __init__(self, run: Run, device: torch.device) -> None:
-        self.settings, self.device = exemplar.fit_strides(run.settings, *run.exemplar.shape[:2]), device
+        self.settings, self.device = run.settings, device
         self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
         self.stretch = stretch_to(run.settings.critic_contrast, run.exemplar, device)
 

@@ -68,7 +68,6 @@ ROWS: dict[str, tuple[str, Settings]] = {
         ),
     ),
     "patch": ("patches of 128²", as_paper("patch")),
-    "strides": ("patches of neighbouring pixels only", as_paper("strides")),
     "batch": ("batches of 16", as_paper("batch")),
     "rotations": ("Euler angles from [0°, 90°]", as_paper("rotations")),
     "transposed": ("patches are not transposed", as_paper("transposed")),

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from solidgrain.runtime import ExemplarError
-from solidgrain.train.exemplar import draw_patches, fit_strides, measure_grain, nonstationarity
+from solidgrain.train.exemplar import draw_patches, measure_grain, nonstationarity
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.settings import preset
 from tests.train.conftest import blotches
@@ -122,28 +122,10 @@ def test_a_huge_photograph_is_refused_before_it_is_read(tmp_path):
 def test_patches_come_from_the_exemplar_flipped_and_transposed(photograph):
     image = torch.from_numpy(read_exemplar(photograph, 64)).permute(2, 0, 1)
     generator = torch.Generator().manual_seed(0)
-    patches = draw_patches(image, preset("fast", batch=32, strides=(1,)), generator)
+    patches = draw_patches(image, preset("fast", batch=32), generator)
     assert patches.shape == (32, 3, 64, 64)
     crops = {image[:, y : y + 64, x : x + 64].sum().item() for y in range(17) for x in range(33)}
     assert all(min(abs(patch.sum().item() - crop) for crop in crops) < 0.05 for patch in patches)
-
-
-@pytest.mark.parametrize("grain", ["none", "x"])
-def test_coarse_patches_show_every_second_or_fourth_pixel(grain):
-    numbered = torch.arange(500 * 400.0).reshape(1, 500, 400).repeat(3, 1, 1)
-    patches = draw_patches(numbered, preset("fast", batch=8, grain=grain), torch.Generator().manual_seed(0))
-    for patch, stride in zip(patches[:, 0], [1, 1, 2, 4] * 2, strict=True):
-        steps = {abs(float(patch[0, 1] - patch[0, 0])), abs(float(patch[1, 0] - patch[0, 0]))}
-        assert steps == {stride, 400.0 * stride}
-        assert all(len(patch.diff(dim=axis).unique()) == 1 for axis in (0, 1))
-
-
-@pytest.mark.parametrize(
-    ("side", "strides"), [(64, (1, 1, 1, 1)), (191, (1, 1, 1, 1)), (192, (1, 1, 2, 2)), (384, (1, 1, 2, 4))]
-)
-def test_strides_leave_crops_room_to_move(side, strides):
-    assert fit_strides(preset("fast"), side, 1000).strides == strides
-    assert fit_strides(preset("fast"), 1000, side).strides == strides
 
 
 def test_the_grain_of_stripes_is_along_them():
