@@ -61,11 +61,9 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "octave-span": ("octaves 2^i", as_paper("octave_span")),
     "orthogonal": ("T_i from N(0,1)", as_paper("orthogonal_start")),
     "noise-weight": ("A from N(0,1)", as_paper("noise_weight_start")),
-    "rates": (
-        "constant rates",
-        as_paper(
-            "critic_rate_floor", "critic_half_life", "sampler_rate", "sampler_rate_floor", "sampler_half_life"
-        ),
+    "critic-rate": ("D learns twice as fast", as_paper("critic_rate", "critic_rate_floor")),
+    "sampler-rate": (
+        "constant rates of S", as_paper("sampler_rate", "sampler_rate_floor", "sampler_half_life"),
     ),
     "patch": ("patches of 128²", as_paper("patch")),
     "batch": ("batches of 16", as_paper("batch")),
