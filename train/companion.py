@@ -63,7 +63,10 @@ def first_critic(settings: Settings, generator: torch.Generator) -> Critic:
 def embedded_critic(name: str, device: torch.device) -> Critic:
     """What D has learned beside an embedded space; it learns no more. Raises BundleError if it is gone."""
     bundle = open_bundle(embedded_folder(name))
-    return read_companion(find_companion(bundle, None), bundle).critic.to(device)
+    path = bundle.folder / CRITIC
+    if not path.is_file():
+        raise BundleError(f"{path}: missing; training begins with this critic, a part of the package: install solidgrain again")
+    return read_companion(path, bundle).critic.to(device)
 
 
 def read_companion(path: Path, bundle: Bundle) -> Companion:

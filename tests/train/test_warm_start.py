@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 
 from solidgrain.runtime import BundleError, TrainingError
 from solidgrain.runtime.bundle import embedded_folder, open_bundle
-from solidgrain.train import critic, loop, settings
+from solidgrain.train import companion, critic, loop, settings
 from solidgrain.train.companion import find_companion, read_companion
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.run import open_run
@@ -172,3 +174,11 @@ def test_a_fast_training_begins_with_the_critic_of_the_embedded_space(monkeypatc
 def test_a_critic_that_is_not_there_is_one_line(monkeypatch, tmp_path, photograph):
     with pytest.raises(BundleError, match="no such texture"):
         Trainer(new_run(tmp_path / "run", photograph, critic_start="stones"), CPU)
+
+
+def test_an_installation_without_the_critic_says_what_to_do(monkeypatch, tmp_path, photograph):
+    stone = shutil.copytree(embedded_folder("stone"), tmp_path / "stone")
+    (stone / "critic.npz").unlink()
+    monkeypatch.setattr(companion, "embedded_folder", lambda name: stone)
+    with pytest.raises(BundleError, match=r"critic.npz: missing; .* install solidgrain again"):
+        Trainer(new_run(tmp_path / "run", photograph, critic_start="stone"), CPU)
