@@ -32,11 +32,6 @@ def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = Fa
     near the origin or far from it; BundleError if the bundle cannot be written.
     """
     run = open_run(run_folder)
-    if run.settings.noise_at_input:
-        raise TrainingError(
-            f"{run_folder}: a run with --variant {run.settings.variant} feeds noise at the input, which a bundle cannot hold; "
-            "look at its samples, or train with --variant paper"
-        )
     state = trained_state(run)
     average = make_task(run, torch.device("cpu")).make_model(torch.Generator())
     assert isinstance(average, Sampler)
@@ -55,7 +50,12 @@ def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = Fa
 
 
 def trained_state(run: RunFolder) -> dict[str, Any]:
-    """A run's last checkpoint. Raises TrainingError if there is none."""
+    """A run's last checkpoint. Raises TrainingError if there is none, or if no bundle can hold it."""
+    if run.settings.noise_at_input:
+        raise TrainingError(
+            f"{run.folder}: a run with --variant {run.settings.variant} feeds noise at the input, which a bundle cannot hold; "
+            "look at its samples, or train with --variant paper"
+        )
     state = run.load_checkpoint()
     if state is None:
         raise TrainingError(f"{run.folder}: no checkpoint yet; let solidgrain train --resume {run.folder} go on for a while")

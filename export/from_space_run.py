@@ -28,7 +28,7 @@ from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.probe import probe_patch
 from solidgrain.train.layers import Conv, Linear
 from solidgrain.train.run import pixels_sha256
-from solidgrain.train.sampler import Condition
+from solidgrain.train.sampler import Condition, Sampler
 from solidgrain.train.settings import to_json
 from solidgrain.train.slices import UNIT
 from solidgrain.train.space import Space
@@ -79,6 +79,7 @@ def round_encoder(space: Space) -> None:
 def space_weights(space: Space, patch: int) -> SpaceWeights:
     """A torch space as plain arrays, learning-rate gains applied; transforms in noise texels per exemplar pixel."""
     encoder, mapping, sampler = space.encoder, space.mapping, space.sampler
+    assert isinstance(sampler, Sampler)
     hidden, (weight, bias) = (_dense(layer) for layer in mapping.octaves)
     scale = (sampler.octave_scale.expand(sampler.directions.shape) / UNIT).flatten().numpy()  # [9n]
     octaves = [hidden, (weight * scale, (bias + sampler.directions.flatten().numpy()) * scale)]

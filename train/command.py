@@ -238,8 +238,6 @@ def make_settings(arguments: argparse.Namespace) -> Settings:
     settings = vary(preset((arguments.preset or "fast") + kind, **changes), arguments.variant or "paper")
     if settings.batch % settings.group:
         raise UsageError(f"--batch {settings.batch}: expected a multiple of {settings.group}, the patches per exemplar")
-    if settings.latent and settings.noise_at_input:
-        raise UsageError(f"--variant {settings.variant}: a texture space needs noise in the hidden layers; leave it out")
     return settings
 
 

@@ -23,6 +23,10 @@ class Condition(NamedTuple):
     gamma: Tensor  # [B, hidden layers, m]
     delta: Tensor  # [B, hidden layers, m]
 
+    def styled(self, layer: int, x: Tensor) -> Tensor:
+        """y = gamma phi(...) + delta of a hidden layer, x [B, P, m] its activations."""
+        return self.gamma[:, layer, None].to(x.dtype) * x + self.delta[:, layer, None].to(x.dtype)
+
     def repeated(self, times: int) -> Condition:
         """Each texture for that many images in a row."""
         return Condition(*(part.repeat_interleave(times, dim=0) for part in self))
@@ -96,8 +100,8 @@ class Sampler(Octaves):
             if layer < BINS:
                 y = y + bins[layer] @ self.noise_weights[layer]  # psi(eta) = A eta
             x = activate(y)
-            if condition is not None:  # y = gamma phi(W x + A eta + b) + delta
-                x = condition.gamma[:, layer, None].to(x.dtype) * x + condition.delta[:, layer, None].to(x.dtype)
+            if condition is not None:
+                x = condition.styled(layer, x)
         return self.colored(self.output(x))
 
 
@@ -110,11 +114,13 @@ class NoiseAtInputSampler(Octaves):
         self.hidden = nn.ModuleList(Linear(n if layer == 0 else m, m, generator) for layer in range(HIDDEN_LAYERS))
         self.output = Linear(m, 3, generator, gain=1.0)
 
-    def forward(self, tables: Tensor, points: Tensor) -> Tensor:
+    def forward(self, tables: Tensor, points: Tensor, condition: Condition | None = None) -> Tensor:
         """As `Sampler.forward`."""
-        x = self.noise(tables, points)
-        for dense in self.hidden:
+        x = self.noise(tables, points, condition and condition.transforms)
+        for layer, dense in enumerate(self.hidden):
             x = activate(dense(x))
+            if condition is not None:
+                x = condition.styled(layer, x)
         return self.colored(self.output(x))
 
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from solidgrain.train.encoder import MOMENTS, Encoder
 from solidgrain.train.layers import Linear, activate
-from solidgrain.train.sampler import HIDDEN_LAYERS, Condition, Sampler
+from solidgrain.train.sampler import HIDDEN_LAYERS, Condition, make_sampler
 from solidgrain.train.settings import Settings
 
 MAPPED = 128  # hidden units of Q and of f, and length of the style w
@@ -41,7 +41,7 @@ class Space(nn.Module):
 
     def __init__(self, settings: Settings, generator: torch.Generator) -> None:
         super().__init__()
-        self.sampler = Sampler(settings, generator)
+        self.sampler = make_sampler(settings, generator)
         self.encoder = Encoder(settings, generator)
         self.mapping = Mapping(settings, generator)
 

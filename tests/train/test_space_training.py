@@ -204,8 +204,6 @@ def test_a_space_has_budgets_and_settings_of_its_own(solidgrain, tmp_path, monke
     [
         (["photo.png"], "leave photo.png out"),
         (["--anisotropic"], "--anisotropic: say x or y"),
-        (["--variant", "noise-at-input"], "--variant noise-at-input: a texture space needs noise in the hidden layers"),
-        (["--variant", "henzler"], "--variant henzler: a texture space needs noise in the hidden layers"),
         (["--hold-out", "none.txt"], "--hold-out none.txt: expected a number, or a file with a name per line"),
         (["--batch", "3"], "--batch 3: expected a multiple of 2"),
         (["--patch", "16"], "--patch 16: expected at least 32"),

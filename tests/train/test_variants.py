@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,6 +14,7 @@ from solidgrain.runtime import SolidgrainError, TrainingError
 from solidgrain.train import preview
 from solidgrain.train import vgg as vgg_module
 from solidgrain.train.critic import Critic
+from solidgrain.train.cuts import as_image
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.losses import make_judge, style_loss
 from solidgrain.train.photograph import read_exemplar
@@ -20,8 +22,11 @@ from solidgrain.train.run import Source, create_run, open_run
 from solidgrain.train.sampler import NoiseAtInputSampler, Sampler, make_sampler
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings, from_json, preset, to_json
 from solidgrain.train.slices import draw_rotations, draw_slices, upright
+from solidgrain.train.space_run import open_space_run
 from solidgrain.train.variants import CHANGES, canonical, vary
 from solidgrain.train.vgg import Vgg
+from tests.bench import cells
+from tests.train.spaces import photographs, picture
 from tests.train.test_training import CPU, TINY, losses
 
 
@@ -139,6 +144,23 @@ def test_a_variant_stopped_and_resumed_is_the_uninterrupted_one(name, tmp_path, 
         train(run, Budget(iterations=iterations), CPU)
     assert losses(tmp_path / "parts") == losses(tmp_path / "whole")
     assert losses(tmp_path / "whole")[-1]["style"] > 0
+
+
+@pytest.mark.parametrize("name", ["noise-at-input", "henzler"])
+def test_a_space_with_noise_at_the_input_tells_exemplars_apart_and_is_no_bundle(name, tmp_path, solidgrain):
+    stones = photographs(tmp_path / "stones", 3)
+    flags = ["--out", tmp_path / "run", "--patch", 32, "--batch", 2, "--iterations", 2, "--threads", 1]
+    assert solidgrain("train", "--space", stones, "--variant", name, *flags).code == 0
+    run = open_space_run(tmp_path / "run")
+    assert (run.settings.variant, run.settings.latent, run.settings.noise_at_input) == (name, 32, True)
+    colours = [
+        cells.sampling(run, CPU, as_image(picture(128, 128, seed)))(cells.plane(16, torch.eye(3), np.zeros(3)), 0)
+        for seed in (0, 1)
+    ]
+    assert np.isfinite(colours).all() and np.abs(colours[0] - colours[1]).max() > 0.02
+    outcome = solidgrain("export", tmp_path / "run", "--out", tmp_path / "bundle")
+    assert outcome.code == 1 and "feeds noise at the input, which a bundle cannot hold" in outcome.error
+    assert not (tmp_path / "bundle").exists()
 
 
 def test_the_critic_learns_unless_no_term_needs_it(tmp_path, photograph):
