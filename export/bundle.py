@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -82,9 +82,16 @@ class Details:
     card: str = ""
 
 
-def write_bundle(folder: Path, content: SamplerWeights | SpaceWeights, details: Details, overwrite: bool = False) -> Path:
-    """Write a bundle folder, whole or not at all.
+def write_bundle(
+    folder: Path,
+    content: SamplerWeights | SpaceWeights,
+    details: Details,
+    overwrite: bool = False,
+    add: Callable[[Path], None] = lambda folder: None,
+) -> Path:
+    """Write a bundle folder, whole or not at all: what it would replace stays, or comes back.
 
+    `add` writes what the manifest does not list into the folder, once everything else is in it.
     Raises BundleError if the folder exists (and `overwrite` is not set, or it is not a bundle) or cannot be written.
     """
     if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
@@ -98,6 +105,7 @@ def write_bundle(folder: Path, content: SamplerWeights | SpaceWeights, details: 
     try:
         building.mkdir(parents=True)
         _fill(building, content, details)
+        add(building)
         for path in building.iterdir():
             sync(path)
         if folder.exists():
@@ -106,6 +114,8 @@ def write_bundle(folder: Path, content: SamplerWeights | SpaceWeights, details: 
     except OSError as error:
         raise BundleError(f"{folder}: cannot write the bundle ({error.strerror})") from error
     finally:
+        if former.exists() and not folder.exists():
+            former.rename(folder)
         shutil.rmtree(building, ignore_errors=True)
         shutil.rmtree(former, ignore_errors=True)
     return folder

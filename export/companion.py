@@ -28,8 +28,8 @@ def write_companion(path: Path, critic: Mapping[str, Tensor], settings: Settings
     }
     arrays = {name: tensor.half().numpy() for name, tensor in critic.items()}
     if strange := [name for name, array in arrays.items() if not np.isfinite(array).all()]:
-        raise TrainingError(f"{path}: {strange[0]} of the critic exceeds half precision; train the space again")
+        raise TrainingError(f"{path.name}: {strange[0]} of the critic exceeds half precision; train the space again")
     try:
         write_arrays(path, {"header": np.array(json.dumps(header)), **arrays})
     except OSError as error:
-        raise BundleError(f"{path}: cannot write the critic ({error.strerror})") from error
+        raise BundleError(f"{path.name}: cannot write the critic ({error.strerror})") from error

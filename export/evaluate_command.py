@@ -41,6 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
         check_sheet(arguments.sheet, arguments.exemplar)
     inception = Inception(arguments.inception) if arguments.inception else None
     texture = load_texture(arguments.source, bundle=arguments.bundle, threads=arguments.threads)
+    if arguments.card and texture.bundle.is_space:
+        raise UsageError(f"--card: {texture.bundle.name} is a space, its card not that of one texture; leave --card out")
     scale = arguments.patch_scale or scale_of(texture.bundle)
     exemplar = read_exemplar(arguments.exemplar, SMALLEST, scale)
     print(f"measuring {2 * arguments.slices} slices of {texture.name}", file=sys.stderr)

@@ -60,10 +60,12 @@ def export_space_run(run_folder: Path, out: Path, name: str = "", overwrite: boo
     check_space_agreement(average, weights)
     name, training = name or out.name, provenance(run, state)
     details = Details(name=name, patch=run.settings.patch, training=training, card=write_card(name, training))
-    folder = write_bundle(out, weights, details, overwrite)
-    if companion:
-        write_companion(folder / CRITIC, state["critic"], run.settings, file_sha256(folder / SAMPLER))
-    return folder
+
+    def add(folder: Path) -> None:
+        if companion:
+            write_companion(folder / CRITIC, state["critic"], run.settings, file_sha256(folder / SAMPLER))
+
+    return write_bundle(out, weights, details, overwrite, add)
 
 
 @torch.no_grad()

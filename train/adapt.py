@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from solidgrain.runtime.bundle import SAMPLER, Bundle
-from solidgrain.runtime.errors import BundleError, TrainingError
+from solidgrain.runtime.errors import BundleError, ExemplarError, TrainingError
 from solidgrain.runtime.fold import read_weights
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.collection import LEVELS, Member, draw_patches, wraps
@@ -204,20 +204,25 @@ class Adaptation:
     @torch.no_grad()
     def _mean_grams(self, photograph: FloatArray) -> list[Tensor]:
         """What L_style compares with: since F is fixed, crops of the photograph need to be looked at only once."""
-        pixels = np.round(photograph * LEVELS).astype(np.uint16)
-        member = Member("", pixels, wraps(photograph))
+        member = Member("", np.round(photograph * LEVELS).astype(np.uint16), wraps(photograph))
+        height, width = photograph.shape[:2]
+        if min(height, width) < self.settings.patch:
+            raise ExemplarError(
+                f"{width}x{height} pixels to adapt to: expected at least {self.settings.patch} along each side, as many as a "
+                "patch of this space's training has; leave --crop out, lower --patch-scale, or give a larger photograph"
+            )
 
         def look() -> Sequence[Tensor]:
             crops = draw_patches(member, self.settings.patch, self.settings.batch, self.settings, self.generator)
             with self._autocast():
                 return self.features.activations(self.stretch(crops))
 
-        return mean_grams(look() for _ in range(self.recipe.crops // self.settings.batch))
+        return mean_grams(look() for _ in range(math.ceil(self.recipe.crops / self.settings.batch)))
 
     @torch.no_grad()
     def measure(self, theta: Theta) -> float:
         """L_style over many slices, the same ones whenever it is called."""
-        generator = torch.Generator(self.generator.device).manual_seed(self.settings.seed + 1)
+        generator = torch.Generator(self.generator.device).manual_seed((self.settings.seed + 1) % 2**64)
         tables = draw_tables(self.settings.octaves, self.settings.resolution, generator)
         return float(torch.stack([self._style(theta, tables, generator) for _ in range(self.recipe.measured)]).mean())
 

@@ -13,7 +13,8 @@ from solidgrain.bake.arguments import parse_count, parse_positive, parse_seconds
 from solidgrain.bake.flags import add_cut
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.space import DEFAULT_SPACE
-from solidgrain.train.command import INTERRUPTED, StopRequest, choose_device
+from solidgrain.train.command import INTERRUPTED, choose_device
+from solidgrain.train.console import Progress, StopRequest
 
 if TYPE_CHECKING:
     import torch
@@ -68,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     start, material = read_photo(space, arguments)
     sampler = FrozenSampler(space.bundle, start, device)
     budget = make_budget(arguments)
-    stop, progress = StopRequest(arguments.quiet), Progress(budget, arguments.quiet)
+    stop, progress = StopRequest(arguments.quiet), Progress(budget, arguments.quiet, describe)
     found = adapt(
         start, sampler, material, features, settings, budget, device, on_report=progress.show, should_stop=stop.requested
     )
@@ -79,6 +80,10 @@ def run(arguments: argparse.Namespace) -> int:
     space.open(found.texture).save(arguments.out)
     say(found, space, arguments)
     return INTERRUPTED if found.ended == "stopped" else 0
+
+
+def describe(report: Report, done: float, left: float) -> str:
+    return f"iteration {report.iteration}, at most {left:.0f} s left, L_style {report.style:.4f}"
 
 
 def check_flags(arguments: argparse.Namespace) -> None:
@@ -152,24 +157,3 @@ def say(found: Adapted, space: Space, arguments: argparse.Namespace) -> None:
     print(f"L_style {found.start:.4f} -> {found.end:.4f}, {spent} ({WHY[found.ended]})", file=sys.stderr)
     bundle = "" if find_bundle(found.texture.sampler_sha256, arguments.out.parent) else f" --bundle {arguments.bundle}"
     print(f"{arguments.out}: next: solidgrain bake {arguments.out}{bundle} --size 128 --out out.vti", file=sys.stderr)
-
-
-class Progress:
-    """One line that rewrites itself on a terminal, a line every half minute in a log."""
-
-    def __init__(self, budget: Budget, quiet: bool) -> None:
-        self.budget, self.quiet, self.terminal = budget, quiet, sys.stderr.isatty()
-        self.printed = 0.0
-
-    def show(self, report: Report) -> None:
-        if self.quiet or (not self.terminal and report.seconds - self.printed < 30):
-            return
-        self.printed = report.seconds
-        done = self.budget.progress(report.iteration, report.seconds)
-        left = report.seconds * max(1 - done, 0) / done
-        line = f"iteration {report.iteration}, at most {left:.0f} s left, L_style {report.style:.4f}"
-        print(f"\r{line}  " if self.terminal else line, end="" if self.terminal else "\n", file=sys.stderr, flush=True)
-
-    def end(self) -> None:
-        if self.terminal and not self.quiet:
-            print(file=sys.stderr)

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal
 
 from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive, parse_scale, parse_seed
 from solidgrain.runtime.errors import TrainingError, UsageError
+from solidgrain.train.console import Progress, StopRequest
 from solidgrain.train.variants import CHANGES, canonical
 
 if TYPE_CHECKING:
     import torch
 
-    from solidgrain.train.loop import Report
+    from solidgrain.train.loop import Ending, Report
     from solidgrain.train.processes import Processes
     from solidgrain.train.run import Run, RunFolder
     from solidgrain.train.settings import Budget, Settings
@@ -112,23 +111,43 @@ def train_together(arguments: argparse.Namespace, device: torch.device, processe
 
     training = processes.one_after_another(lambda: begin(arguments, device, processes.first))
     stop = StopRequest(quiet=not processes.first)
-    progress = Progress(training.budget, arguments.quiet)
+    progress = Progress(training.budget, arguments.quiet, describe)
     with processes.errors_once():
-        report = train(training, training.budget, device, progress.show, stop.requested, progress.warn, processes)
+        ending = train(training, training.budget, device, progress.show, stop.requested, progress.warn, processes)
     stopped = processes.any(stop.requested())
+    progress.end()
     if processes.first:
-        print(how_to_go_on(training, stopped, report.iteration if report else 0), file=sys.stderr)
+        flags = budget_flags(arguments) if arguments.resume else ""  # which the run's own budget does not know
+        print(how_to_go_on(training, stopped, ending, flags), file=sys.stderr)
     return INTERRUPTED if stopped else 0
 
 
-def how_to_go_on(training: RunFolder, stopped: bool, iterations: int) -> str:
+def describe(report: Report, done: float, left: float) -> str:
+    return (
+        f"iteration {report.iteration}, {report.seconds / report.iteration:.2f} s each, "
+        f"{done:.0%}, {left / 60:.1f} min left, L_D {report.critic_loss:.2f}, L_style {report.style:.4f}"
+    )
+
+
+def how_to_go_on(training: RunFolder, stopped: bool, ending: Ending, flags: str) -> str:
+    from solidgrain.train.run import CHECKPOINT
+
     folder = training.folder
-    done = f"done after {iterations} iterations" if training.budget.until_plateau else "done"
+    done = f"done after {ending.iteration} iterations" if training.budget.until_plateau else "done"
     if stopped:
-        return f"stopped and saved; go on with: solidgrain train --resume {folder}"
+        return f"stopped{' and saved' * ending.saved}; go on with: solidgrain train --resume {folder}{flags}"
+    if not (folder / CHECKPOINT).exists():
+        return f"{folder}: {done}, and nothing is worth keeping; train again with another --seed"
     if training.settings.noise_at_input:
         return f"{folder}: {done}; its slices are in {folder / 'samples'}; a bundle cannot hold noise at the input"
     return f"{folder}: {done}; next: solidgrain export {folder} --out BUNDLE"
+
+
+def budget_flags(arguments: argparse.Namespace) -> str:
+    """The budget as it was given, to be given again."""
+    counts = (("--iterations", arguments.iterations), ("--minutes", arguments.minutes))
+    given = "".join(f" {flag} {count}" for flag, count in counts if count is not None)
+    return given + " --until-plateau" * bool(arguments.until_plateau)
 
 
 def begin(arguments: argparse.Namespace, device: torch.device, first: bool) -> RunFolder:
@@ -198,15 +217,12 @@ def start(arguments: argparse.Namespace) -> Run:
     from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
     from solidgrain.train.photograph import read_photograph, scaled
     from solidgrain.train.run import Source, create_run
-    from solidgrain.train.vgg import find_weights
 
     if arguments.exemplar is None:
         raise UsageError("no EXEMPLAR given; expected a photograph to learn from, or --space FOLDER")
     if strange := [flag for flag in ("hold_out", "skip_unreadable") if getattr(arguments, flag) is not None]:
         raise UsageError(f"--{strange[0].replace('_', '-')}: is about the photographs of a --space; leave it out")
     settings = make_settings(arguments)
-    if settings.style_features == "vgg":
-        find_weights()  # before there is a run directory
     scale = arguments.patch_scale or 1.0
     if scale < 1:
         raise UsageError(f"--patch-scale {scale:g}: expected 1 or more; photographs are reduced, never enlarged")
@@ -226,9 +242,10 @@ def start(arguments: argparse.Namespace) -> Run:
 
 
 def make_settings(arguments: argparse.Namespace) -> Settings:
-    """The preset, with what the flags change. Raises UsageError for a patch that is too small."""
+    """The preset, with what the flags change. Raises UsageError for a patch that is too small, SolidgrainError without VGG."""
     from solidgrain.train.settings import preset
     from solidgrain.train.variants import vary
+    from solidgrain.train.vgg import find_weights
 
     changes = {name: getattr(arguments, name) for name in ("patch", "batch", "seed", "precision")}
     changes = {name: value for name, value in changes.items() if value is not None}
@@ -238,6 +255,8 @@ def make_settings(arguments: argparse.Namespace) -> Settings:
     settings = vary(preset((arguments.preset or "fast") + kind, **changes), arguments.variant or "paper")
     if settings.batch % settings.group:
         raise UsageError(f"--batch {settings.batch}: expected a multiple of {settings.group}, the patches per exemplar")
+    if settings.style_features == "vgg":
+        find_weights()  # before there is a run directory
     return settings
 
 
@@ -288,47 +307,3 @@ def choose_device(name: str) -> torch.device:
             f"--device cuda: torch {torch.__version__} sees no CUDA device; use --device cpu or install a CUDA build"
         )
     return torch.device("cuda" if name == "cuda" or (name == "auto" and available) else "cpu")
-
-
-class StopRequest:
-    """Ctrl-C or SIGTERM asks the loop to finish its iteration and save; a second one stops at once."""
-
-    def __init__(self, quiet: bool) -> None:
-        self._requested, self._quiet = False, quiet
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._request)
-
-    def requested(self) -> bool:
-        return self._requested
-
-    def _request(self, number: int, frame: FrameType | None) -> None:
-        if self._requested:
-            raise KeyboardInterrupt
-        self._requested = True
-        if not self._quiet:
-            print("\nfinishing this iteration; once more to stop at once", file=sys.stderr)
-
-
-class Progress:
-    """One line that rewrites itself on a terminal, a line every so often in a log."""
-
-    def __init__(self, budget: Budget, quiet: bool) -> None:
-        self.budget, self.quiet, self.terminal = budget, quiet, sys.stderr.isatty()
-        self.printed = -60.0
-
-    def show(self, report: Report) -> None:
-        if self.quiet or (not self.terminal and report.seconds - self.printed < 30):
-            return
-        self.printed = report.seconds
-        done = self.budget.progress(report.iteration, report.seconds)
-        left = report.seconds * (1 - done) / done / 60
-        line = (
-            f"iteration {report.iteration}, {report.seconds / report.iteration:.2f} s each, "
-            f"{done:.0%}, {left:.1f} min left, L_D {report.critic_loss:.2f}, L_style {report.style:.4f}"
-        )
-        print(f"\r{line}  " if self.terminal else line, end="" if self.terminal else "\n", file=sys.stderr, flush=True)
-
-    def warn(self, warning: str) -> None:
-        """A line that stays, whether quiet or not."""
-        end_of_progress = "\n" if self.terminal and not self.quiet else ""
-        print(f"{end_of_progress}warning: {warning}", file=sys.stderr, flush=True)

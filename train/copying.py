@@ -52,7 +52,7 @@ def measure_copying(exemplar: FloatArray, sample: Sample, grain: str = "none") -
     The search is exhaustive: every place in the exemplar, in each orientation in which training may have shown it.
     """
     image = as_image(exemplar)
-    count = min(MOST, max(FEWEST, MOST * 2**18 // (image.shape[2] * image.shape[3])))
+    count = min(MOST, max(FEWEST, MOST * 2**18 // (image.shape[2] * image.shape[3]))) // SLICES * SLICES
     found, nearest = search(image, made := _synthesised(sample, count, grain), grain)
     first, second = image.tensor_split(2, dim=2 if image.shape[2] > image.shape[3] else 3)
     generator = torch.Generator().manual_seed(2)

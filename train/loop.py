@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -38,6 +38,13 @@ class Report:
     penalty: float | None  # where this iteration had one
     style: float  # L_style
     adversarial: float  # E[D(f)]
+
+
+class Ending(NamedTuple):
+    """How far a training has come."""
+
+    iteration: int
+    saved: bool  # not if that state is in doubt
 
 
 class Trainer:
@@ -81,6 +88,8 @@ class Trainer:
 
         self._update_average()
         self.iteration += 1
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)  # or the time would be that of launching kernels
         return self._report(time.monotonic() - started, critic_loss, penalty, style, adversarial)
 
     def _report(
@@ -236,7 +245,7 @@ def train(
     should_stop: Callable[[], bool] = lambda: False,
     on_warning: Callable[[str], None] = lambda line: None,
     processes: Processes = ALONE,
-) -> Report | None:
+) -> Ending:
     """Train until the budget is spent, a plateau that it asks for is reached, or `should_stop` says so; from the run's last
     checkpoint if there is one.
 
@@ -248,8 +257,10 @@ def train(
     trainer.load()
     if processes.first:
         run.rewind_stats(trainer.iteration)
-    settings, report = run.settings, None
+    settings = run.settings
     onlooker = Onlooker(settings, run.exemplar, device) if budget.until_plateau and isinstance(run, Run) else None
+    if onlooker:
+        trainer.plateau.take_up(trainer.iteration)
 
     while not budget.done(trainer.iteration, trainer.seconds) and not processes.any(should_stop()):
         if onlooker and processes.any(trainer.plateau.reached(trainer.iteration)):
@@ -282,7 +293,7 @@ def train(
         if doubt:
             on_warning(f"iteration {trainer.iteration} is not saved ({doubt}); the last checkpoint stays")
         _write_sample(trainer)
-    return report
+    return Ending(trainer.iteration, not doubt)
 
 
 def parameter_groups(model: nn.Module, settings: Settings) -> list[dict[str, Any]]:

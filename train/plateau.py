@@ -37,13 +37,20 @@ class Plateau:
 
     lowest: float = math.inf
     at: int = 0  # iteration
+    looked: int = 0  # the last time
 
     def see(self, distance: float, iteration: int) -> None:
         if distance < (1 - GAIN) * self.lowest:
             self.lowest, self.at = distance, iteration
+        self.looked = iteration
 
     def reached(self, iteration: int) -> bool:
-        return iteration - self.at >= max(LEAST, SHARE * self.at)
+        return math.isfinite(self.lowest) and iteration - self.at >= max(LEAST, SHARE * self.at)
+
+    def take_up(self, iteration: int) -> None:
+        """Forget what was seen before a stretch of training without an onlooker."""
+        if iteration - self.looked > EVERY:
+            self.lowest, self.at = math.inf, 0
 
     def state(self) -> dict[str, Any]:
         return asdict(self)

@@ -23,9 +23,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from solidgrain.runtime.errors import ExemplarError
 from solidgrain.train.cuts import Sample, as_image, axis_rotation, cut, oblique_rotation, random_place
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
+from solidgrain.train.losses import gram_difference, gram_matrices
 from solidgrain.train.vgg import STYLE_LAYERS, Vgg
 
 Measures = dict[str, float]
@@ -33,6 +35,7 @@ Measures = dict[str, float]
 FRECHET_LAYERS, GRAM_LAYERS = (1, 3), STYLE_LAYERS
 LARGEST_CROP = 256  # pixels
 SMALLEST = 64  # pixels along each side of an exemplar: its crops must outlast the pyramids
+SMALLEST_FLOOR = 1e-6  # between colours: a photograph's is a thousand times that
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ def evaluate(
     """Measure axis-aligned and oblique slices of a texture, one of each per seed, against its exemplar.
 
     With a grain only those orientations are taken that a slice through its axis has, since no loss ever saw the others.
+    Raises ExemplarError if the exemplar's parts are all the same: there is no floor then.
     """
     measure = Measure(inception)
     image = as_image(exemplar)
@@ -62,6 +66,11 @@ def evaluate(
     crops = [measure.statistics(square) for square in squares]
     pairs = [(a, b) for i, a in enumerate(crops) for b in crops[:i]]
     floor = _mean(measure.distances(a, b) for a, b in pairs[:15])
+    if floor["color"] < SMALLEST_FLOOR:
+        raise ExemplarError(
+            f"the exemplar has the same colours in each of its squares of {size}² pixels, so that nothing tells how far apart "
+            "its own parts are; expected a photograph that neither repeats itself nor is of one colour, or one period of it"
+        )
     quarter = [measure.statistics(square.rot90(1, (2, 3))) for square in squares[:4]]
     turned = _mean(measure.distances(a, b) for i, a in enumerate(crops[:4]) for j, b in enumerate(quarter) if i != j)
 
@@ -114,8 +123,8 @@ class Measure:
         levels = [F.avg_pool2d(image, factor) for factor in (1, 2, 4)]
         return Statistics(
             moments=[_moments(F.avg_pool2d(features[layer], 2)) for layer in FRECHET_LAYERS],
-            grams=[_gram(features[layer]) for layer in GRAM_LAYERS if layer < len(features)],
-            coarse_grams=[_gram(coarse[layer]) for layer in GRAM_LAYERS if layer < len(coarse)],
+            grams=[gram_matrices(features[layer], 1) for layer in GRAM_LAYERS if layer < len(features)],
+            coarse_grams=[gram_matrices(coarse[layer], 1) for layer in GRAM_LAYERS if layer < len(coarse)],
             patches=[_projections(F.unfold(level, 7)[0].T, 256) for level in levels],
             colors=_projections(image.flatten(2)[0].T, 32),
             inception=_moments(self.inception.features(image)) if self.inception else None,
@@ -147,15 +156,8 @@ def _frechet(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> float:
     return float(((mean_a - mean_b) ** 2).sum() + cov_a.trace() + cov_b.trace() - 2 * root)
 
 
-def _gram(features: Tensor) -> Tensor:
-    flat = features.flatten(2)[0]
-    gram: Tensor = flat @ flat.T / flat.shape[1]
-    return gram
-
-
 def _gram_distance(exemplar: list[Tensor], other: list[Tensor]) -> float:
-    terms = [float((a - b).abs().mean() / a.abs().mean()) for a, b in zip(exemplar, other, strict=True)]
-    return float(np.mean(terms))
+    return float(np.mean([float(gram_difference(a, b, relative=True)) for a, b in zip(exemplar, other, strict=True)]))
 
 
 def _projections(vectors: Tensor, count: int) -> Tensor:

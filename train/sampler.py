@@ -41,11 +41,11 @@ class Octaves(nn.Module):
 
     def __init__(self, settings: Settings, generator: torch.Generator) -> None:
         super().__init__()
-        # A function of the exemplar, not of the training: no part of its state.
-        self.register_buffer("color_mean", torch.zeros(3, device=generator.device), persistent=False)
-        self.register_buffer("color_axes", torch.eye(3, device=generator.device), persistent=False)
+        self.register_buffer("color_mean", torch.zeros(3, device=generator.device))
+        self.register_buffer("color_axes", torch.eye(3, device=generator.device))
+        self.register_load_state_dict_pre_hook(_keep_own_colors)  # type: ignore[no-untyped-call]
         self.directions = nn.Parameter(_start_directions(settings, generator))  # [n, 3, 3]
-        self.register_buffer("octave_scale", _octave_scale(settings).to(generator.device))  # [n, 3, 3] or [n, 1, 1]
+        self.register_buffer("octave_scale", _octave_scale(settings).to(generator.device))  # [n, 1, 3]
         self.offsets: Tensor | None = None  # [n, 3] texels; training shifts its slices at random instead
 
     def transforms(self) -> Tensor:
@@ -57,6 +57,7 @@ class Octaves(nn.Module):
 
         Its three numbers are then deviations from the mean colour, in standard deviations along each axis: whatever the network
         says at first has the material's hues. In plain RGB it has all hues, and unlearning them takes most of a training.
+        Axes are part of the state: an eigenvector's sign, or which of equal ones come, is up to the machine.
         """
         variances, axes = torch.linalg.eigh(covariance.double())
         deviations = variances.clamp(min=0).sqrt()
@@ -127,6 +128,12 @@ class NoiseAtInputSampler(Octaves):
 def make_sampler(settings: Settings, generator: torch.Generator) -> Sampler | NoiseAtInputSampler:
     """The sampler that the settings ask for."""
     return NoiseAtInputSampler(settings, generator) if settings.noise_at_input else Sampler(settings, generator)
+
+
+def _keep_own_colors(sampler: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """States of earlier versions have no colours: they computed them from the exemplar whenever they were read."""
+    for name in ("color_mean", "color_axes"):
+        state.setdefault(prefix + name, getattr(sampler, name))
 
 
 def _octave_scale(settings: Settings) -> Tensor:

@@ -13,6 +13,8 @@ from solidgrain.train.loop import Trainer
 from solidgrain.train.run import RunFolder, is_space, open_run, read_checkpoint
 from solidgrain.train.space_run import open_space_run
 
+COLORS = ("color_mean", "color_axes")  # what S's output is relative to
+
 
 def learned(other: Path) -> dict[str, Any]:
     """The checkpoint of another run, of either kind, or a file that is one. Raises TrainingError if there is none."""
@@ -27,8 +29,9 @@ def learned(other: Path) -> dict[str, Any]:
 def warm_start(run: RunFolder, found: dict[str, Any], device: torch.device) -> tuple[int, int]:
     """Give a new run a checkpoint at iteration 0 with the weights of another one: its critic's and its average's.
 
-    A single exemplar's sampler fits a space's as far as shapes go: all but what depends on the number of octaves. Returns how
-    many parameter tensors were taken over, and how many start afresh. Raises TrainingError if no layer of the sampler fits.
+    A single exemplar's sampler fits a space's as far as shapes go: all but what depends on the number of octaves. The axes
+    of the colours come along from space to space only; else they are those of the new run's exemplars. Returns how many
+    parameter tensors were taken over, and how many start afresh. Raises TrainingError if no layer of the sampler fits.
     """
     trainer = Trainer(run, device)
     taken = [
@@ -55,8 +58,9 @@ def _take_over(model: nn.Module, state: dict[str, Tensor]) -> set[str]:
 
 def _renamed(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> dict[str, Tensor]:
     """The state under the names of a model of the other kind: a space keeps its sampler under a name of its own."""
-    if "sampler.constant" in wanted and "constant" in state:
-        return {f"sampler.{name}": value for name, value in state.items()}
-    if "constant" in wanted and "sampler.constant" in state:
-        return {name.removeprefix("sampler."): value for name, value in state.items()}
-    return state
+    if "sampler.directions" in wanted and "sampler.directions" in state:
+        return state
+    own = {name: value for name, value in state.items() if not name.endswith(COLORS)}
+    if "sampler.directions" in wanted and "directions" in state:
+        return {f"sampler.{name}": value for name, value in own.items()}
+    return {name.removeprefix("sampler."): value for name, value in own.items()}

@@ -150,13 +150,42 @@ def _spent(run: Run) -> tuple[int, float]:
     return (0, 0.0) if state is None else (state["iteration"], state["seconds"] / 60)
 
 
-def sampling(run: RunFolder, device: torch.device, *conditions: Tensor) -> Sample:
-    """The run's averaged model as a function of points in exemplar pixels and a seed, with the runtime's noise.
+@dataclass(frozen=True)
+class Opened:
+    """A run's averaged model, in torch, since bundles cannot hold every variant."""
 
-    `conditions` are what a model needs besides points and noise: for a space the patch [1, 3, 128, 128]. In torch, since
-    bundles cannot hold every variant. Points are moved to the origin first, where float32 coordinates are exact enough: a
-    texture is the same everywhere.
-    """
+    model: Any
+    iteration: int
+    octaves: int
+    device: torch.device
+
+    def sampling(self, *conditions: Tensor) -> Sample:
+        """The model as a function of points in exemplar pixels and a seed, with the runtime's noise.
+
+        `conditions` are what a model needs besides points and noise: for a space the patch [1, 3, 128, 128]. Points are moved
+        to the origin first, where float32 coordinates are exact enough: a texture is the same everywhere.
+        """
+        model, device = self.model, self.device
+        sampler = model.sampler if isinstance(model, Space) else model
+        instance: dict[int, tuple[Tensor, Tensor]] = {}
+
+        @torch.no_grad()
+        def sample(points: np.ndarray[Any, np.dtype[np.float64]], seed: int) -> FloatArray:
+            if seed not in instance:
+                instance.clear()
+                noise = noise_tables(seed, self.octaves), noise_offsets(seed, self.octaves).astype(np.float32)
+                instance[seed] = torch.from_numpy(noise[0]).to(device), torch.from_numpy(noise[1]).to(device)
+            tables, sampler.offsets = instance[seed]
+            near = torch.from_numpy((points - points.mean(0)) / UNIT).float().to(device)
+            rgb = torch.cat([model(tables, chunk[None], *conditions)[0] for chunk in torch.split(near, CHUNK)])
+            found: FloatArray = rgb.clamp(0, 1).cpu().numpy()
+            return found
+
+        return sample
+
+
+def opened(run: RunFolder, device: torch.device) -> Opened:
+    """A run as of its last checkpoint. Raises TrainingError if there is none."""
     state = run.load_checkpoint()
     if state is None:
         raise TrainingError(f"{run.folder}: no checkpoint to measure")
@@ -164,21 +193,12 @@ def sampling(run: RunFolder, device: torch.device, *conditions: Tensor) -> Sampl
     model.load_state_dict(state["average"])
     if isinstance(run, Run):
         settle_mean(model, run.exemplar)  # as an export does
-    octaves = model.sampler if isinstance(model, Space) else model
-    instance: dict[int, Tensor] = {}
+    return Opened(model, state["iteration"], run.settings.octaves, device)
 
-    @torch.no_grad()
-    def sample(points: np.ndarray[Any, np.dtype[np.float64]], seed: int) -> FloatArray:
-        if seed not in instance:
-            instance.clear()
-            instance[seed] = torch.from_numpy(noise_tables(seed, run.settings.octaves)).to(device)
-            octaves.offsets = torch.from_numpy(noise_offsets(seed, run.settings.octaves)).float().to(device)
-        near = torch.from_numpy((points - points.mean(0)) / UNIT).float().to(device)
-        rgb = torch.cat([model(instance[seed], chunk[None], *conditions)[0] for chunk in torch.split(near, CHUNK)])
-        found: FloatArray = rgb.clamp(0, 1).cpu().numpy()
-        return found
 
-    return sample
+def sampling(run: RunFolder, device: torch.device, *conditions: Tensor) -> Sample:
+    """The run's averaged model, opened for one texture."""
+    return opened(run, device).sampling(*conditions)
 
 
 def plane(size: int, rotation: Tensor, middle: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:

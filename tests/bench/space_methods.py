@@ -33,6 +33,15 @@ SamplesOf = Callable[[FloatArray], Sample]  # the patch that is encoded -> its t
 
 
 @dataclass(frozen=True)
+class Other:
+    """The space of another method."""
+
+    samples_of: SamplesOf
+    held_out: frozenset[str]  # file names of photographs that it was never trained on
+    iterations: int
+
+
+@dataclass(frozen=True)
 class Methods:
     """Every way to make a texture of a patch."""
 
@@ -40,7 +49,7 @@ class Methods:
     threads: int
     budget: tuple[str, str] | None  # of adapting, as its command takes it; None if there is none
     critic: Path | None  # of adapting, where the bundle does not hold it
-    henzler: SamplesOf | None
+    henzler: Other | None
 
     @property
     def passes(self) -> list[list[str]]:
@@ -52,7 +61,7 @@ class Methods:
         """A column's texture of the patch that lies in the folder as `exemplar.png`, adapted unless it was before."""
         if column == "henzler":
             assert self.henzler is not None
-            return self.henzler(patch)
+            return self.henzler.samples_of(patch)
         if column == "unadapted":
             texture = self.space.encode(patch, folder.name)
             texture.save(folder / "unadapted.sgt.npz")
@@ -81,15 +90,18 @@ class Methods:
         part.unlink()
 
 
-def open_henzler(source: Path, threads: int) -> SamplesOf:
+def open_henzler(source: Path, threads: int) -> Other:
     """The space of another method: a bundle, or a run directory, in torch, for what bundles cannot hold.
 
-    Raises UsageError if it is neither.
+    Raises UsageError if it is neither, TrainingError for a run without a checkpoint.
     """
     if (source / MANIFEST).is_file():
         space = load_space(source, threads=threads)
-        return lambda patch: space.encode(patch).sample
+        training = space.bundle.manifest["training"]
+        names = frozenset(training.get("held_out") or ())
+        return Other(lambda patch: space.encode(patch).sample, names, training.get("iterations", 0))
     if not (source / OPTIONS).is_file():
         raise UsageError(f"--henzler {os.fspath(source)}: neither a bundle nor a run directory; give that of a texture space")
     run = open_space_run(source)
-    return lambda patch: cells.sampling(run, torch.device("cpu"), as_image(patch))
+    trained = cells.opened(run, torch.device("cpu"))
+    return Other(lambda patch: trained.sampling(as_image(patch)), run.held_out, trained.iteration)

@@ -38,7 +38,7 @@ from solidgrain.train.quality import SMALLEST, Measure
 from tests.bench import cells, space_pictures, space_report
 from tests.bench.paper_table import slice_picture
 from tests.bench.space_measure import Reference, cut_crops, measure_slices
-from tests.bench.space_methods import ADAPTED, TITLES, Methods, open_henzler
+from tests.bench.space_methods import ADAPTED, TITLES, Methods, Other, open_henzler
 
 EXEMPLARS = Path(__file__).resolve().parents[3] / "shared" / "data" / "exemplars"
 FAR = Path("wood128") / "Wood081.png"  # in EXEMPLARS
@@ -85,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     check(every, arguments.only)
     inception = Inception(arguments.inception) if arguments.inception else None
     measure, methods = Measure(inception), methods_of(space, arguments)
-    settle(space, arguments)
+    settle(space, methods.henzler, arguments)
     chosen = [one for one in every if arguments.only is None or one.name in arguments.only]
     missing = fill(chosen, methods, measure, arguments.slices, arguments.out)
     space_pictures.write_interpolations(arguments.out / "interpolation.png", space, [one.encoded for one in groups["held-out"]])
@@ -163,6 +163,8 @@ def methods_of(space: Space, arguments: argparse.Namespace) -> Methods:
     if not arguments.only_unadapted:
         find_companion(space.bundle, arguments.critic)
     henzler = open_henzler(arguments.henzler, arguments.threads) if arguments.henzler else None
+    if henzler and (seen := set(space.bundle.manifest["training"]["held_out"]) - henzler.held_out):
+        raise UsageError(f"--henzler {arguments.henzler}: was trained on {min(seen)}; --hold-out the same photographs")
     budget = None if arguments.only_unadapted else budget_of(arguments)
     return Methods(space, arguments.threads, budget, arguments.critic, henzler)
 
@@ -174,7 +176,7 @@ def budget_of(arguments: argparse.Namespace) -> tuple[str, str]:
     return "--seconds", f"{arguments.seconds:g}"
 
 
-def settle(space: Space, arguments: argparse.Namespace) -> None:
+def settle(space: Space, henzler: Other | None, arguments: argparse.Namespace) -> None:
     """What results depend on, part by part, so that a part can be added later."""
     out, resume = arguments.out, arguments.resume
     manifest = space.bundle.manifest
@@ -186,8 +188,9 @@ def settle(space: Space, arguments: argparse.Namespace) -> None:
         cells.settle(out / "large", {"patch-scale": arguments.patch_scale}, resume=True)
     if not arguments.only_unadapted:
         cells.settle(out / "adapted", {"budget": " ".join(budget_of(arguments))}, resume=True)
-    if arguments.henzler:
-        cells.settle(out / "henzler", {"henzler": str(arguments.henzler.resolve())}, resume=True)
+    if henzler:
+        facts = {"henzler": str(arguments.henzler.resolve()), "iterations": henzler.iterations}
+        cells.settle(out / "henzler", facts, resume=True)
 
 
 def fill(subjects: Sequence[Subject], methods: Methods, measure: Measure, slices: int, out: Path) -> int:

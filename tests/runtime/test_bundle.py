@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,6 +56,15 @@ def test_a_texture_of_another_bundle_is_refused_with_the_sha256_that_it_needs(tm
     toy.save(tmp_path / "mine.sgt.npz")
     with pytest.raises(BundleError, match=toy.data.sampler_sha256[:12]):
         load(tmp_path / "mine.sgt.npz", bundle=load("granite").bundle.folder)
+
+
+def test_the_bundle_of_a_texture_file_is_named_as_any_other(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    granite = load("granite")
+    granite.save("mine.sgt.npz")
+    assert load("mine.sgt.npz", bundle="granite").bundle.folder == granite.bundle.folder
+    with pytest.raises(BundleError, match=r"granit: no such .* did you mean granite"):
+        load("mine.sgt.npz", bundle="granit")
 
 
 @pytest.mark.parametrize("name", ["sampler.onnx", "texture.sgt.npz"])
@@ -192,3 +202,22 @@ def test_a_provider_that_cannot_be_had_is_an_error_that_lists_the_others():
 
 def test_the_provider_that_runs_is_named(toy_folder):
     assert load(toy_folder, provider="cpu").provider == "CPUExecutionProvider"
+
+
+@pytest.mark.parametrize("where", ["add", "rename"])
+def test_a_bundle_that_cannot_be_replaced_stays(tmp_path, monkeypatch, where):
+    folder = write_bundle(tmp_path / "toy", toy_weights(seed=1), Details(name="toy", patch=64))
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    def rename(path, target, rename=Path.rename):
+        return fail() if where == "rename" and path.name.endswith(".tmp") else rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", rename)
+    more = {"add": fail} if where == "add" else {}
+    with pytest.raises(BundleError, match="No space left"):
+        write_bundle(folder, toy_weights(seed=2), Details(name="toy", patch=64), overwrite=True, **more)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["toy"]

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from solidgrain.export.from_space_run import export_space_run
-from solidgrain.runtime import BundleError, TrainingError, load_space, load_texture
+from solidgrain.runtime import BundleError, ExemplarError, TrainingError, load_space, load_texture
 from solidgrain.runtime.bundle import CRITIC, open_bundle
 from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.train.adapt import (
@@ -26,8 +26,8 @@ from solidgrain.train.adapt import (
     critic_features,
     vgg_features,
 )
-from solidgrain.train.command import StopRequest
 from solidgrain.train.companion import read_companion
+from solidgrain.train.console import StopRequest
 from solidgrain.train.loop import Trainer
 from solidgrain.train.noise import look_up
 from solidgrain.train.settings import Budget
@@ -72,8 +72,8 @@ def run(space, companion, clouds):
     """Adapt the toy space's texture of the clouds; keywords replace arguments of `adapt`, or settings."""
     start = space.encode(clouds, "clouds").data
 
-    def call(iterations=20, seed=0, features=None, **changes):
-        settings = replace(companion.settings, patch=32, batch=2, precision="float32", seed=seed)
+    def call(iterations=20, seed=0, features=None, patch=32, batch=2, **changes):
+        settings = replace(companion.settings, patch=patch, batch=batch, precision="float32", seed=seed)
         sampler = FrozenSampler(space.bundle, start, CPU)
         features = features or critic_features(companion, CPU)
         arguments = {"recipe": RECIPE, "budget": Budget(iterations), **changes}
@@ -221,6 +221,16 @@ def test_the_texture_file_loads_and_bakes(solidgrain, toy_space_folder, photo, t
     np.testing.assert_allclose(np.load(baked), texture.grid((4, 4, 4)), atol=1 / 255)
     assert solidgrain("adapt", photo, *flags).code == 1
     assert solidgrain("adapt", photo, *flags, "--overwrite", "--features", "vgg").code == 0
+
+
+def test_a_photograph_smaller_than_the_space_s_patches_is_one_line(run):
+    with pytest.raises(ExemplarError, match="150x130 pixels to adapt to: expected at least 160"):
+        run(1, patch=160)
+
+
+def test_any_batch_and_any_seed_will_do(run):
+    assert run(1, batch=RECIPE.crops + 1).iterations == 1
+    assert run(1, seed=2**64 - 1).iterations == 1
 
 
 def test_interrupting_saves_what_there_is(solidgrain, toy_space_folder, photo, tmp_path, monkeypatch):

@@ -24,6 +24,18 @@ def sampler_of(variant, exemplar):
     return sampler
 
 
+def test_axes_are_part_of_the_state_and_those_of_earlier_versions_the_reader_s_own():
+    """The sign of an eigenvector is up to the machine: who reads a state must not compute its own axes."""
+    written, read = sampler_of("paper", COLORS), sampler_of("paper", COLORS[:, :, ::-1].copy())
+    state = written.state_dict()
+    state["color_axes"] = -state["color_axes"]
+    own = read.color_axes.clone()
+    read.load_state_dict({name: value for name, value in state.items() if not name.startswith("color_")})
+    torch.testing.assert_close(read.color_axes, own)
+    read.load_state_dict(state)
+    torch.testing.assert_close(read.color_axes, -written.color_axes)
+
+
 @pytest.mark.parametrize("variant", ["paper", "noise-at-input"])
 def test_the_mean_becomes_the_exemplar_s(variant):
     sampler = sampler_of(variant, COLORS)

@@ -98,6 +98,21 @@ def test_a_training_stops_on_a_plateau_and_resumes_to_the_same(tmp_path, photogr
     assert_same_checkpoint(parts.folder, whole.folder)
 
 
+def test_nothing_is_a_plateau_that_was_not_looked_at(tmp_path, photograph, told):
+    assert not Plateau().reached(10_000)
+    stale = seen([0.1])
+    stale.take_up(2 * EVERY)
+    assert stale.lowest == 0.1
+    stale.take_up(10_000)
+    assert not stale.reached(10_000)
+
+    run = new_run(tmp_path / "run", photograph)
+    train(run, Budget(iterations=12), CPU)
+    ending = train(open_run(run.folder), Budget(iterations=50, until_plateau=True), CPU)
+    assert len(told) > 1
+    assert ending.iteration > 12
+
+
 def test_without_being_asked_it_goes_on(tmp_path, photograph, told):
     run = new_run(tmp_path / "run", photograph)
     train(run, Budget(iterations=12), CPU)

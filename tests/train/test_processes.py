@@ -188,7 +188,7 @@ def test_a_signal_to_torchrun_stops_both_processes_and_leaves_a_checkpoint(tmp_p
     assert process.returncode != 0
     assert said(stderr) == [
         "finishing this iteration; once more to stop at once",
-        f"stopped and saved; go on with: solidgrain train --resume {folder}",
+        f"stopped and saved; go on with: solidgrain train --resume {folder} --iterations 10000",
     ]
     state = open_space_run(folder).load_checkpoint()
     assert len(state["other_generators"]) == 1

@@ -9,7 +9,9 @@ pytest.importorskip(
     "stlpips_pytorch", reason="the VGG-16 weights come with stlpips-pytorch: pip install 'solidgrain[evaluate]'"
 )
 
+from solidgrain.runtime import ExemplarError, load_space
 from solidgrain.train.quality import evaluate
+from tests.bench import cells
 from tests.train.conftest import blotches
 
 EXEMPLAR = blotches(128, 128)
@@ -83,6 +85,23 @@ def test_the_command_measures_a_bundle_and_writes_its_card(solidgrain, toy_folde
     assert "Copying: patches are" in outcome.out
     solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
     assert (folder / "card.md").read_text().count("## Quality") == 1
+
+
+def test_a_card_is_not_that_of_one_texture_of_a_space(solidgrain, toy_space_folder, tmp_path):
+    texture = load_space(toy_space_folder).encode(blotches(128, 128), "blotches")
+    texture.save(tmp_path / "blotches.sgt.npz")
+    before = (toy_space_folder / "card.md").read_bytes() if (toy_space_folder / "card.md").exists() else None
+    cells.write_png(tmp_path / "blotches.png", blotches(128, 128))
+    flags = ("--bundle", toy_space_folder, "--exemplar", tmp_path / "blotches.png", "--slices", 1, "--card")
+    outcome = solidgrain("evaluate", tmp_path / "blotches.sgt.npz", *flags)
+    assert (outcome.code, "leave --card out" in outcome.error) == (2, True)
+    assert ((toy_space_folder / "card.md").read_bytes() if before is not None else None) == before
+
+
+@pytest.mark.parametrize("exemplar", [np.tile(EXEMPLAR[:64, :64], (2, 2, 1)), np.full((128, 128, 3), 0.5, np.float32)])
+def test_what_has_no_floor_is_refused(exemplar):
+    with pytest.raises(ExemplarError, match="one period of it"):
+        evaluate(exemplar, resampled, slices=1)
 
 
 @pytest.mark.parametrize(("flags", "code", "message"), [(["--slices", "0"], 2, "--slices"), ([], 1, "at least 64x64")])

@@ -196,6 +196,13 @@ def test_adapting_leaves_a_texture_that_is_called_like_its_photograph_or_says_wh
     assert not list(tmp_path.rglob("*.part*"))
 
 
+def test_another_method_must_not_have_seen_the_photographs_either(flags, toy_space_folder, tmp_path, capsys):
+    assert cells.reported(lambda: space_table.main([*flags, "--only-unadapted", "--henzler", str(toy_space_folder)])) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "was trained on granite.png; --hold-out the same photographs" in line
+    assert not (tmp_path / "out").exists()
+
+
 def test_another_method_has_a_column_of_its_own(flags, bundle, tmp_path):
     space_table.main([*flags, "--only-unadapted", "--only", "granite.png", "--henzler", str(bundle)])
     found = json.loads((tmp_path / "out" / "table.json").read_text())["photographs"]["held-out"]["granite.png"]
@@ -308,6 +315,6 @@ def test_a_run_is_sampled_in_torch_as_its_bundle_is_by_the_runtime(tmp_path):
     patch = read_exemplar(tmp_path / "stones" / "stone2.png", 128)[16:144, 16:144]
     points = cells.plane(16, torch.eye(3), np.array([100.0, 200.0, 300.0]))
     near = points - points.mean(0)  # where a run is sampled
-    of_run, of_bundle = open_henzler(run.folder, 1)(patch), space.encode(patch).sample
+    of_run, of_bundle = open_henzler(run.folder, 1).samples_of(patch), space.encode(patch).sample
     np.testing.assert_allclose(of_run(points, 3), of_bundle(near, 3), atol=5e-3)  # E is rounded to half precision
     assert np.abs(of_run(points, 3) - of_run(points, 4)).max() > 0.02

@@ -18,6 +18,7 @@ from solidgrain.export.evaluation import scale_of
 from solidgrain.export.from_run import check_agreement, export_run, sampler_weights
 from solidgrain.runtime import BundleError, TrainingError, load
 from solidgrain.runtime.bundle import open_bundle
+from solidgrain.train import command
 from solidgrain.train.loop import train
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, open_run
@@ -204,6 +205,14 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, photograph):
     assert f"solidgrain train --resume {folder}" in err
     done = open_run(folder).load_checkpoint()["iteration"]
     assert losses(folder)[-1]["iteration"] == done
+
+
+def test_who_resumes_with_another_budget_is_told_it_again(tmp_path, photograph, solidgrain, monkeypatch):
+    new_run(tmp_path / "run", photograph)
+    monkeypatch.setattr(command.StopRequest, "requested", lambda self: True)
+    outcome = solidgrain("train", "--resume", tmp_path / "run", "--minutes", 1.5, "--threads", 1)
+    assert outcome.code == 130
+    assert outcome.err.splitlines()[-1].endswith(f"solidgrain train --resume {tmp_path / 'run'} --minutes 1.5")
 
 
 def test_the_command_line_trains_and_exports(solidgrain, tmp_path, photograph):

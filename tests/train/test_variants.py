@@ -186,10 +186,11 @@ def test_missing_vgg_weights_are_an_error_before_there_is_a_run(solidgrain, tmp_
     monkeypatch.setattr(vgg_module.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SolidgrainError, match=r"solidgrain\[evaluate\]"):
         Vgg()
-    outcome = solidgrain("train", photograph, "--out", tmp_path / "run", "--variant", "henzler", "--patch", 32)
-    assert outcome.code == 1
-    assert "solidgrain[evaluate]" in outcome.error
-    assert not (tmp_path / "run").exists()
+    for what in ([photograph], ["--space", photographs(tmp_path / "stones", 2)]):
+        outcome = solidgrain("train", *what, "--out", tmp_path / "run", "--variant", "henzler", "--patch", 32)
+        assert outcome.code == 1
+        assert "solidgrain[evaluate]" in outcome.error
+        assert not (tmp_path / "run").exists()
 
 
 def test_export_refuses_a_sampler_that_a_bundle_cannot_hold(tmp_path, photograph):

@@ -85,7 +85,7 @@ def test_a_space_begins_with_all_of_another_space(tmp_path, space):
 def test_a_single_exemplar_begins_with_a_space_s_sampler_as_far_as_it_fits(tmp_path, space, photograph):
     run = new_run(tmp_path / "run", photograph, octaves=8, **SAME_WIDTH)
     warm_start(run, learned(space.folder), CPU)
-    assert taken_over(run, space)[1] == {"directions", "noise_weights", "octave_scale"}
+    assert taken_over(run, space)[1] == {"directions", "noise_weights", "octave_scale", "color_mean", "color_axes"}
 
 
 def test_a_single_exemplar_begins_with_all_of_another_and_its_octaves_as_they_became(tmp_path, single, photograph):
@@ -182,3 +182,15 @@ def test_an_installation_without_the_critic_says_what_to_do(monkeypatch, tmp_pat
     monkeypatch.setattr(companion, "embedded_folder", lambda name: stone)
     with pytest.raises(BundleError, match=r"critic.npz: missing; .* install solidgrain again"):
         Trainer(new_run(tmp_path / "run", photograph, critic_start="stone"), CPU)
+
+
+@pytest.mark.parametrize("wanted", ["paper", "noise-at-input"])
+@pytest.mark.parametrize("given", ["paper", "noise-at-input"])
+def test_kinds_of_runs_and_of_samplers_may_differ(tmp_path, photograph, given, wanted):
+    """Whatever enters the noise at the input shares its hidden layers but the first, and its output, with the method."""
+    single = new_run(tmp_path / "single", photograph, octaves=8, noise_at_input=given == "noise-at-input", **SAME_WIDTH)
+    train(single, Budget(iterations=1), CPU)
+    space = new_space(tmp_path / "space", noise_at_input=wanted == "noise-at-input")
+    warm_start(space, learned(single.folder), CPU)
+    layer = single.load_checkpoint()["average"]["hidden.1.weight"]
+    torch.testing.assert_close(space.load_checkpoint()["average"]["sampler.hidden.1.weight"], layer)
