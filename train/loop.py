@@ -258,9 +258,7 @@ def train(
     if processes.first:
         run.rewind_stats(trainer.iteration)
     settings = run.settings
-    onlooker = Onlooker(settings, run.exemplar, device) if budget.until_plateau and isinstance(run, Run) else None
-    if onlooker:
-        trainer.plateau.take_up(trainer.iteration)
+    onlooker = _call_onlooker(trainer) if budget.until_plateau else None
 
     while not budget.done(trainer.iteration, trainer.seconds) and not processes.any(should_stop()):
         if onlooker and processes.any(trainer.plateau.reached(trainer.iteration)):
@@ -294,6 +292,13 @@ def train(
             on_warning(f"iteration {trainer.iteration} is not saved ({doubt}); the last checkpoint stays")
         _write_sample(trainer)
     return Ending(trainer.iteration, not doubt)
+
+
+def _call_onlooker(trainer: Trainer) -> Onlooker:
+    """What tells a plateau, from now on."""
+    assert isinstance(trainer.run, Run)
+    trainer.plateau.take_up(trainer.iteration)
+    return Onlooker(trainer.settings, trainer.run.exemplar, trainer.device)
 
 
 def parameter_groups(model: nn.Module, settings: Settings) -> list[dict[str, Any]]:
