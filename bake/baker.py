@@ -114,6 +114,7 @@ def _jobs(plan: Plan, workers: Workers, shard: Shard | None, keep: bool) -> Iter
             writer = open_writer(output, plan.volume, workers)
             staging = open_staging(output.path, plan.work(output), plan.size[2], writer.reserved, shard, fresh=not keep)
             jobs.append(Job(output, writer, staging))
+            staging.keep_plan(plan)
         yield jobs
     except BaseException as error:
         for job in jobs:

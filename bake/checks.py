@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from solidgrain.bake.manifest import is_complete, manifest_path
+from solidgrain.bake.manifest import is_complete, manifest_path, own_manifest
 from solidgrain.bake.plan import Plan, format_bytes, format_size
-from solidgrain.bake.staging import discard_staging, is_begun, staged_bytes, staging_folder
+from solidgrain.bake.staging import WORK, discard_staging, is_begun, read_work, staged_bytes, staging_folder
 from solidgrain.bake.writers import Output, check_output, output_bytes, output_exists, output_files, scratch_bytes
 from solidgrain.runtime.errors import BakeError, UsageError
 
@@ -41,12 +42,29 @@ def without_existing(plan: Plan) -> Plan:
     return replace(plan, outputs=tuple(kept))
 
 
-def without_complete(plan: Plan) -> Plan:
-    """The plan without the outputs that are whole and of this plan. What a kill left beside them is removed."""
-    complete = {output.path for output in plan.outputs if is_complete(plan, output)}
-    for path in complete:
-        discard_staging(path)
+def without_complete(plan: Plan, discard: bool = True) -> Plan:
+    """The plan without the outputs that are whole and of this plan.
+
+    With `discard`, what a kill has left of them is removed. What another plan waits for beside them stays.
+    """
+    complete = {output.path: output for output in plan.outputs if is_complete(plan, output)}
+    for path, output in complete.items():
+        if discard and _is_own(plan, output):
+            discard_staging(path)
     return replace(plan, outputs=tuple(output for output in plan.outputs if output.path not in complete))
+
+
+def leaves_nothing(plan: Plan) -> bool:
+    """Whether a bake of a plan that failed left no output, and no part of one."""
+    return bool(plan.outputs) and not any(
+        staging_folder(output.path).exists() or own_manifest(plan, output) for output in plan.outputs
+    )
+
+
+def _is_own(plan: Plan, output: Output) -> bool:
+    """Whether the staging of an output is this plan's. One that has lost its name is nobody's, and nobody will miss it."""
+    path = staging_folder(output.path) / WORK
+    return not path.exists() or read_work(path) == json.loads(json.dumps(plan.work(output)))
 
 
 def _check_file(path: Path, overwrite: bool, taken: set[Path]) -> None:

@@ -71,7 +71,10 @@ def _run(arguments: list[str]) -> int:
     """The command, and one line for each kind of error."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _interrupt)  # farms stop jobs with SIGTERM: clean up as for Ctrl-C
-    parser, module = _parser(arguments)
+    try:
+        parser, module = _parser(arguments)
+    except ModuleNotFoundError as error:
+        return _missing(error, _called(arguments))
     options = parser.parse_args(arguments)
     if module is None:
         parser.print_help()
@@ -88,10 +91,7 @@ def _run(arguments: list[str]) -> int:
     except SolidgrainError as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
-        package = (error.name or "").split(".")[0]
-        if package not in EXTRAS:
-            raise
-        return _fail(f"{options.command} needs the package {package}; pip install 'solidgrain[{EXTRAS[package]}]'")
+        return _missing(error, options.command)
     except OSError as error:
         if error.filename is None:  # stdout: a closed pipe, a full device
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains once more on exit
@@ -103,7 +103,7 @@ def _parser(arguments: Sequence[str]) -> tuple[Parser, ModuleType | None]:
     """The parser, with the arguments of the one command that is called, and that command's module."""
     parser = Parser(prog="solidgrain", description="Solid textures from one photograph: train, export, bake, view.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    called = next((word for word in arguments if not word.startswith("-")), None)
+    called = _called(arguments)
     module = None
     for name, (module_name, summary) in COMMANDS.items():
         command = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
@@ -111,6 +111,11 @@ def _parser(arguments: Sequence[str]) -> tuple[Parser, ModuleType | None]:
             module = importlib.import_module(module_name)
             module.add_arguments(command)
     return parser, module
+
+
+def _called(arguments: Sequence[str]) -> str | None:
+    """The command that is called."""
+    return next((word for word in arguments if not word.startswith("-")), None)
 
 
 def _glue_negative(arguments: list[str]) -> list[str]:
@@ -122,6 +127,14 @@ def _glue_negative(arguments: list[str]) -> list[str]:
         else:
             glued.append(word)
     return glued
+
+
+def _missing(error: ModuleNotFoundError, command: str | None) -> int:
+    """Name the extra that brings a package. What no extra brings is raised again."""
+    package = (error.name or "").split(".")[0]
+    if package not in EXTRAS:
+        raise error
+    return _fail(f"{command} needs the package {package}; pip install 'solidgrain[{EXTRAS[package]}]'")
 
 
 def _fail(message: str) -> int:

@@ -1,8 +1,9 @@
 """Baking on a Dask cluster: shards as tasks that any worker may take up, and a merge when all are done.
 
-A task gets the plan and returns a few numbers; texels never travel. Its worker loads the texture itself, once, and evaluates
-with as many threads as Dask gave it. Shards are idempotent: a worker that was killed leaves its share of the staging, whose
-lock is free at once, and whoever is given the shard next takes up what is there.
+A task gets the plan and returns a few numbers; texels never travel. Its worker loads the texture itself, once, and bakes one
+shard at a time with as many threads as Dask gave it: tasks that Dask starts beside it wait. Shards are idempotent: a worker
+that was killed leaves its share of the staging, whose lock is free at once, and whoever is given the shard next takes up what
+is there.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import os
 import signal
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +32,7 @@ RETRIES = 3
 PAUSE = 2.0  # seconds before Dask tries a failed shard again: another process that holds it may be done by then
 PATIENCE = 10.0  # seconds for a scheduler to answer
 LOCAL = "local:"
+ALONE = threading.Lock()  # of a worker process: whoever holds it has all of its threads
 
 
 def parse_cluster(text: str) -> str:
@@ -105,11 +108,13 @@ def bake_shard(values: dict[str, Any], number: int, count: int, provider: str, t
     from solidgrain.bake.verify import check_texture
 
     plan = plan_of(values, "the plan of the Dask task")
-    texture = _texture(plan.source, plan.bundle, plan.precision, provider, threads or get_worker().state.nthreads)
+    with ALONE:  # or several tasks would load it at once
+        texture = _texture(plan.source, plan.bundle, plan.precision, provider, threads or get_worker().state.nthreads)
     check_texture(plan, texture, f"worker {socket.gethostname()}")
     shard = plan.shard(number, count)
     try:
-        baked = bake(plan, texture, shard=shard)
+        with ALONE:
+            baked = bake(plan, texture, shard=shard)
     except BakeError:
         time.sleep(PAUSE)
         raise

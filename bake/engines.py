@@ -27,7 +27,7 @@ from solidgrain.runtime.errors import UsageError
 
 VOLUME_SIDE, IMAGE_SIDE = 2048, 16384
 ATLASES = (".atlas.png", ".atlas.exr")
-VOLUME_TEXTURES = (".dds", ".ktx2", ".raw", *ATLASES)  # kinds that an engine loads as a whole
+VOLUME_TEXTURES = (".dds", ".raw", *ATLASES)  # kinds that an engine loads as a whole
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from solidgrain.bake.plan import Plan, located
 
@@ -13,6 +14,13 @@ def anywhere(plan: Plan) -> Plan:
     """The plan with absolute paths: the same work, from any working folder."""
     outputs = tuple(replace(output, path=output.path.absolute()) for output in plan.outputs)
     return replace(plan, outputs=outputs, source=located(plan.source), bundle=plan.bundle and located(plan.bundle))
+
+
+def seen_from(folder: Path, plan: Plan) -> Plan:
+    """`anywhere`, but outputs in `folder` go by their names alone: it may be moved, or be seen elsewhere."""
+    plan, folder = anywhere(plan), folder.absolute()
+    outputs = (replace(one, path=Path(one.path.name)) if one.path.parent == folder else one for one in plan.outputs)
+    return replace(plan, outputs=tuple(outputs))
 
 
 def shard_count(plan: Plan, asked: int | None) -> int:

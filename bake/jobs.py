@@ -99,7 +99,7 @@ def _read_job(parser: JobParser, values: dict[str, Any], where: str, folder: Pat
         [word for key, value in values.items() if key not in OWN for word in _flag(parser, key, value)], arguments
     )
     arguments.source = _source(values.get("texture"), folder)
-    arguments.bundle = os.fspath(folder / values["bundle"]) if "bundle" in values else None
+    arguments.bundle = _source(values.get("bundle"), folder)
     given = values.get("out", [])
     outputs: list[dict[str, Any]] = [
         {"path": out} if isinstance(out, str) else dict(out) for out in (given if isinstance(given, list) else [given])
@@ -135,13 +135,13 @@ def _flat(value: Any) -> Iterator[Any]:
         yield value
 
 
-def _source(texture: str | None, folder: Path) -> str | None:
-    """A texture by its embedded name, or by its path from the job file's folder."""
+def _source(name: str | None, folder: Path) -> str | None:
+    """A texture or bundle by its embedded name, or by its path from the job file's folder."""
     from solidgrain.runtime.bundle import embedded_bundles
 
-    if texture is None or texture in embedded_bundles():
-        return texture
-    return os.fspath(folder / texture) if os.sep in texture or (folder / texture).exists() else texture
+    if name is None or name in embedded_bundles():
+        return name
+    return os.fspath(folder / name) if os.sep in name or (folder / name).exists() else name
 
 
 def plan_jobs(

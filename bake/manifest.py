@@ -102,10 +102,16 @@ def damaged_files(manifest: dict[str, Any], folder: Path) -> list[str]:
     return wrong
 
 
-def is_complete(plan: Plan, output: Output) -> bool:
-    """Whether the files of an output are there, whole, and of this very plan."""
+def own_manifest(plan: Plan, output: Output) -> dict[str, Any] | None:
+    """The manifest of an output, if it is of this very plan."""
     try:
         manifest = read_manifest(manifest_path(output.path))
     except BakeError:
-        return False
-    return manifest["work"] == hash_of(plan.work(output)) and not damaged_files(manifest, output.path.parent)
+        return None
+    return manifest if manifest["work"] == hash_of(plan.work(output)) else None
+
+
+def is_complete(plan: Plan, output: Output) -> bool:
+    """Whether the files of an output are there, whole, and of this very plan."""
+    manifest = own_manifest(plan, output)
+    return manifest is not None and not damaged_files(manifest, output.path.parent)

@@ -14,6 +14,10 @@ from solidgrain.runtime.bundle import MANIFEST
 
 SLAB_BYTES = 48 * 2**20  # of float32 colour; what a bake holds at a time is a small multiple of it
 THICKEST_SLAB = 16  # slices
+IN_FLIGHT = 3  # slabs: one is evaluated while two wait for the disk (baker.AHEAD)
+ENCODING = 4  # slabs' worth that a writer holds at most, with a thread for each slice: half-float EXR needs 3.6
+DITHERING = 9  # the same where noise is made, from hashes of 64 bits: 8
+AVERAGING = 3.25  # the same, times the samples per voxel: themselves, their linear light, a term of it, and where that holds
 BASE_MEMORY = 220 * 2**20  # interpreter, libraries, noise tables, the chunks in flight
 FORMAT_VERSION = 1  # of plans and manifests
 BYTES_VERSION = 1  # of what writers make of a plan: one more with every change of it
@@ -67,10 +71,11 @@ class Plan:
 
     @property
     def memory(self) -> int:
-        """An upper estimate of resident bytes: the slab, what writers make of it, coordinates and file names, and the rest."""
+        """An upper estimate of resident bytes: slabs, what is made of them, coordinates and file names, and the rest."""
         width, height, depth = self.size
-        slice_bytes = width * height * 12
-        return BASE_MEMORY + 4 * self.slab * slice_bytes * self.samples + 64 * (width + height) + 1024 * depth
+        dithered = any(output.options.get("dither") for output in self.outputs)
+        held = IN_FLIGHT + (DITHERING if dithered else ENCODING) + (AVERAGING * self.samples if self.samples > 1 else 0)
+        return BASE_MEMORY + int(held * self.slab * width * height * 12) + 64 * (width + height) + 1024 * depth
 
     def shard(self, number: int, count: int) -> tuple[int, int]:
         """The slices (first, stop) of shard `number` of `count`, counted from 1: whole slabs, none twice."""

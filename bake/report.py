@@ -124,6 +124,9 @@ class Progress:
     def finish(self, plan: Plan, texture: Texture, baked: Baked, slices: int) -> None:
         if self.quiet:
             return
+        if not slices:
+            sys.stderr.write(f"{plan.texture}: no slabs in this share\n")
+            return
         rate = plan.volume.voxels * (slices - baked.reused_slices) / plan.size[2] / baked.seconds / 1e6
         reused = f", {baked.reused_slices} slices were there" if baked.reused_slices else ""
         sys.stderr.write(f"{plan.texture}: {len(baked.files)} files in {baked.seconds:.1f} s, {rate:.2f} Mvoxel/s{reused}\n")

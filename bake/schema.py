@@ -58,7 +58,7 @@ def _normal(values: dict[str, Any]) -> dict[str, Any]:
     return normal | {key: int(values[key]) for key in ("seed", "samples") if key in values}
 
 
-def checked_output(output: Output, where: str, **options: str | int) -> Output:
+def checked_output(output: Output, where: str, /, **options: str | int) -> Output:
     """An output with options on top, if its format knows them all. Missing ones get their defaults. Raises UsageError."""
     if output.kind not in formats():
         raise UsageError(f"{where}.kind: unknown format {output.kind!r}, expected one of {', '.join(formats())}")

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.runtime import BakeError, ExemplarError, Space, Texture, UsageError, load_space
+from solidgrain.runtime import BakeError, BundleError, ExemplarError, Space, Texture, UsageError, load_space
 from solidgrain.runtime.space import DEFAULT_SPACE
 from solidgrain.runtime.texture_file import read_texture
 from solidgrain.train.photograph import SUFFIXES, read_photograph, scaled  # what a bake shares with training: no torch
+
+if TYPE_CHECKING:
+    from solidgrain.bake.plan import Plan
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -72,7 +75,7 @@ def check_new(file: Path, overwrite: bool) -> None:
 
 
 class Encoded:
-    """The textures of photographs that are to be baked, by the texture files that they become.
+    """The textures of photographs that are to be baked, by the texture files that they become and their precision.
 
     A bake of a photograph saves the texture beside its first output, and its plan names that file: whoever verifies, resumes
     or shares the work needs neither the photograph nor an encoder that agrees to the last bit.
@@ -80,7 +83,9 @@ class Encoded:
 
     def __init__(self, on_note: Note = _silent) -> None:
         self.on_note = on_note
-        self.textures: dict[Path, Texture] = {}
+        self.textures: dict[tuple[Path, str], Texture] = {}
+        self.made: list[Path] = []  # files that were not there before
+        self._spaces: dict[tuple[str, str], Space] = {}  # by name and precision
 
     def settle(self, arguments: argparse.Namespace) -> None:
         """Encode the photograph that a bake's arguments name, and let them name its texture file instead.
@@ -93,30 +98,68 @@ class Encoded:
             if cut != WHERE_IT_IS:
                 raise UsageError("--patch-scale and --crop: are about photographs, and SOURCE is none; leave them out")
             return
-        space = load_space(
-            arguments.bundle or DEFAULT_SPACE,
-            provider=arguments.provider,
-            precision=arguments.precision or "float32",
-            threads=arguments.threads,
-        )
-        texture = encode_photograph(space, Path(arguments.source), cut, self.on_note)
+        texture = encode_photograph(self._space(arguments), Path(arguments.source), cut, self.on_note)
         folder = next((path.parent for path in (*arguments.out, arguments.preview) if path), Path())
         file = (folder / f"{texture.name}{TEXTURE_SUFFIX}").absolute()
-        same = self.textures.setdefault(file, texture)
-        if same.data.sha256 != texture.data.sha256:
+        others = (other for (path, _), other in self.textures.items() if path == file)
+        if any(other.data.sha256 != texture.data.sha256 for other in others):
             raise BakeError(f"{file}: two textures would be saved there; bake them into folders of their own")
-        if file.exists() and not (arguments.overwrite or arguments.update) and read_texture(file).sha256 != texture.data.sha256:
-            raise BakeError(f"{file}: exists, and is another texture; move it away, or --overwrite")
+        if file.exists() and not _holds(file, texture):
+            raise BakeError(
+                f"{file}: exists, and is another texture than {arguments.source} encodes to; move it away, choose another "
+                "folder for --out, or bake the texture file itself"
+            )
+        self.textures.setdefault((file, _precision(arguments)), texture)
         arguments.source = str(file)
+
+    def _space(self, arguments: argparse.Namespace) -> Space:
+        """The space that encodes a photograph, loaded once."""
+        key = (arguments.bundle or DEFAULT_SPACE, _precision(arguments))
+        if key not in self._spaces:
+            self._spaces[key] = load_space(key[0], provider=arguments.provider, precision=key[1], threads=arguments.threads)
+        return self._spaces[key]
 
     def load(self, arguments: argparse.Namespace) -> Texture | None:
         """The texture that a bake's arguments name, if it is one of these."""
-        return self.textures.get(Path(arguments.source)) if arguments.source else None
+        return self.textures.get((Path(arguments.source), _precision(arguments))) if arguments.source else None
+
+    def tell_missing(self) -> None:
+        """Say which texture files a plan needs that only a bake would write."""
+        for file in sorted({file for file, _ in self.textures if not file.exists()}):
+            self.on_note(
+                f"{file}: is not there yet, and the plan needs it; bake without --dry-run writes it, or solidgrain encode with "
+                "the same --patch-scale and --crop"
+            )
 
     def save(self) -> None:
-        """Write the texture files. Raises BundleError if one cannot be written."""
-        for file, texture in self.textures.items():
-            texture.save(file)
+        """Write the texture files that are not there, and let go of all textures. Raises BundleError if it cannot be done."""
+        for (file, _), texture in self.textures.items():
+            if not file.exists():
+                self.made.append(file)
+                texture.save(file)
+        self.textures.clear()
+        self._spaces.clear()
+
+    def remove_unused(self, plans: Iterable[Plan]) -> None:
+        """Remove the files that this run made for plans of which nothing is left: no output, and no part of one to resume."""
+        from solidgrain.bake.checks import leaves_nothing
+
+        used = {plan.source for plan in plans if not leaves_nothing(plan)}
+        for file in self.made:
+            if str(file) not in used:
+                file.unlink(missing_ok=True)
+
+
+def _precision(arguments: argparse.Namespace) -> str:
+    return arguments.precision or "float32"
+
+
+def _holds(file: Path, texture: Texture) -> bool:
+    """Whether a file is this texture's. One that is damaged or of another kind is not."""
+    try:
+        return read_texture(file).sha256 == texture.data.sha256
+    except BundleError:
+        return False
 
 
 def cut_patch(pixels: FloatArray, size: int, cut: Cut, name: str) -> tuple[FloatArray, str]:

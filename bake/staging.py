@@ -3,6 +3,7 @@
     .granite.vti.baking/
       lock               held while a process works here (flock: a dead owner does not hold it)
       work.json          what the bytes depend on
+      plan.json          all of the plan that was baked here last, for `merge`
       journal.000000000  a line of JSON per slab: where its bytes are, and their SHA-256; one journal per shard
       data.000000000     the slabs' bytes, one stream per shard; or whole files, one per slice
       finished.json      the complete files, their checksums and destinations; written before the first is put in place
@@ -20,12 +21,13 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from solidgrain.bake.plan import hash_of
+from solidgrain.bake.farm import seen_from
+from solidgrain.bake.plan import Plan, hash_of
 from solidgrain.bake.store import Encoded, Finished, Record, Span, Store, sha256_of
 from solidgrain.runtime.errors import BakeError
 from solidgrain.runtime.files import replacing
 
-LOCK, WORK, FINISHED, JOURNAL = "lock", "work.json", "finished.json", "journal"
+LOCK, WORK, PLAN, FINISHED, JOURNAL = "lock", "work.json", "plan.json", "finished.json", "journal"
 
 
 class Staging(Store):
@@ -40,6 +42,14 @@ class Staging(Store):
         self.in_place = False  # files have begun to get their names
         self._locks = locks
         self._journal = folder / f"{JOURNAL}.{self.first:09d}"
+
+    def keep_plan(self, plan: Plan) -> None:
+        """Note where the texture and all outputs are, which the work does not say."""
+        path = self.folder / PLAN
+        content = json.dumps(seen_from(self.folder.parent, plan).to_json(), indent=1).encode()
+        if not path.exists() or path.read_bytes() != content:
+            with replacing(path) as file:
+                file.write(content)
 
     def append(self, z: int, slices: int, encoded: Encoded) -> Record:
         record = super().append(z, slices, encoded)

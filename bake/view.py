@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 
 def read_volume(path: Path) -> pyvista.ImageData:
-    """A volume with RGB point data `rgb` (uint8), from `.vti` (or what else pyvista reads) or `.npy` [z, y, x, 3] in [0, 1].
+    """A volume with RGB point data `rgb` (uint8), from `.vti` (or what else pyvista reads) or `.npy` [z, y, x, 3].
 
+    Floats are colours from 0 to 1, unsigned whole numbers from 0 to the largest of their type.
     Raises ViewError if the file is missing, unreadable or holds no colours.
     """
     import pyvista
@@ -50,7 +51,9 @@ def _from_array(path: Path) -> pyvista.ImageData:
     except (OSError, ValueError, EOFError) as error:
         raise ViewError(f"{path}: not readable as a NumPy array") from error
     if array.ndim != 4 or array.shape[-1] != 3 or array.size == 0 or array.dtype.kind not in "fu":
-        raise ViewError(f"{path}: {array.dtype} of shape {array.shape}, expected floats or uint8, [z, y, x, 3]")
+        raise ViewError(
+            f"{path}: {array.dtype} of shape {array.shape}, expected floats or unsigned whole numbers, [z, y, x, 3]"
+        )
     if not np.isfinite(array).all():
         raise ViewError(f"{path}: holds NaN or infinity, expected colours from 0 to 1")
     image = pyvista.ImageData(dimensions=array.shape[2::-1], origin=(0.5, 0.5, 0.5))
@@ -61,7 +64,8 @@ def _from_array(path: Path) -> pyvista.ImageData:
 def _bytes(colors: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     if colors.dtype == np.uint8:
         return colors
-    scaled: npt.NDArray[np.uint8] = (np.clip(colors, 0, 1) * 255 + 0.5).astype(np.uint8)
+    largest = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1
+    scaled: npt.NDArray[np.uint8] = (np.clip(colors, 0, largest) * np.float32(255 / largest) + 0.5).astype(np.uint8)
     return scaled
 
 

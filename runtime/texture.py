@@ -44,14 +44,14 @@ def load_texture(
 ) -> Texture:
     """Load a texture by embedded name, from a bundle folder, or from a saved texture file.
 
-    `bundle` names the bundle of a texture file that neither lies in it nor belongs to an embedded one. `provider` "auto" is
-    the fused kernel, or ONNX Runtime on the CPU where there is no kernel for this machine or bundle (`Texture.provider` and
-    `provider_note` say which and why); "kernel" insists; "cpu", "cuda", "directml", "coreml", "openvino" are ONNX Runtime's
-    execution providers. One that cannot be had is an error. `precision` "bfloat16" is faster where the processor has AMX,
-    and an error elsewhere. `threads` of 0 uses every processor that this process may use. Raises BundleError or
-    ProviderError; for a space, which is no texture, BundleError.
+    `bundle` names the bundle of a texture file that neither lies in it nor belongs to an embedded one, by its folder or its
+    embedded name. `provider` "auto" is the fused kernel, or ONNX Runtime on the CPU where there is no kernel for this
+    machine or bundle (`Texture.provider` and `provider_note` say which and why); "kernel" insists; "cpu", "cuda",
+    "directml", "coreml", "openvino" are ONNX Runtime's execution providers. One that cannot be had is an error. `precision`
+    "bfloat16" is faster where the processor has AMX, and an error elsewhere. `threads` of 0 uses every processor that this
+    process may use. Raises BundleError or ProviderError; for a space, which is no texture, BundleError.
     """
-    data, owner = _resolve(os.fspath(source), None if bundle is None else Path(bundle))
+    data, owner = _resolve(os.fspath(source), None if bundle is None else os.fspath(bundle))
     return open_texture(data, owner, provider, precision, make_workers(threads))
 
 
@@ -70,11 +70,11 @@ def make_workers(threads: int) -> Workers:
     return Workers(count or usable_threads())
 
 
-def _resolve(source: str, bundle: Path | None) -> tuple[TextureData | BlendData, Bundle]:
+def _resolve(source: str, bundle: str | None) -> tuple[TextureData | BlendData, Bundle]:
     path = Path(source)
     if path.is_file():
         data = read_blend(path) if format_of(path) == BLEND_FORMAT else read_texture(path)
-        folder = bundle or find_bundle(data.sampler_sha256, path.parent)
+        folder = find_bundle(data.sampler_sha256, path.parent) if bundle is None else bundle_folder(bundle)
         if folder is None:
             wanted = f"{data.sampler_sha256[:12]}… (texture {data.name!r})"
             raise BundleError(

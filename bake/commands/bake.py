@@ -34,14 +34,19 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("nothing to write: give at least one --out FILE or --preview FILE.png")
     plan = to_do(plan, arguments)
     if arguments.dry_run:
+        encoded.tell_missing()
         report = describe(plan, texture)
         print(json.dumps(report, indent=2) if arguments.json else summary(report))
         return 0
-    encoded.save()
-    if not plan.outputs:
-        report = result(plan, texture, Baked([], 0.0))
-    else:
-        report = emit_job(plan, arguments) if arguments.emit_openjd else bake_plan(plan, texture, arguments)
+    try:
+        encoded.save()
+        if not plan.outputs:
+            report = result(plan, texture, Baked([], 0.0))
+        else:
+            report = emit_job(plan, arguments) if arguments.emit_openjd else bake_plan(plan, texture, arguments)
+    except BaseException:
+        encoded.remove_unused([plan])
+        raise
     if arguments.json:
         print(json.dumps(report, indent=2))
     return 0
@@ -74,11 +79,15 @@ def run_jobs(arguments: argparse.Namespace) -> int:
     read = read_jobs(arguments.jobs, arguments)
     jobs, textures = plan_jobs(read, encoded.settle, lambda named: encoded.load(named) or load_texture(named), to_do)
     if arguments.dry_run:
+        encoded.tell_missing()
         plans = [{"name": one.job.name, **describe(one.plan, textures[one.job.texture])} for one in jobs]
         print(json.dumps({"jobs": plans}, indent=2) if arguments.json else "\n\n".join(map(summary, plans)))
         return 0
-    encoded.save()
-    report = bake_jobs(jobs, textures, bake_plan, tell_error, arguments.continue_on_error)
+    try:
+        encoded.save()
+        report = bake_jobs(jobs, textures, bake_plan, tell_error, arguments.continue_on_error)
+    finally:
+        encoded.remove_unused(one.plan for one in jobs)
     if arguments.json:
         print(json.dumps({"jobs": report}, indent=2))
     return 1 if any(job["status"] == FAILED for job in report) else 0
@@ -114,7 +123,7 @@ def load_texture(arguments: argparse.Namespace) -> Texture:
 
 
 def to_do(plan: Plan, arguments: argparse.Namespace) -> Plan:
-    """The plan without what is done already or must stay, once nothing speaks against it."""
+    """The plan without what is done already or must stay, once nothing speaks against it. A dry run removes nothing."""
     from solidgrain.bake.checks import check_plan, without_complete, without_existing
     from solidgrain.bake.staging import clear_leftovers, is_begun
 
@@ -122,11 +131,11 @@ def to_do(plan: Plan, arguments: argparse.Namespace) -> Plan:
     if arguments.no_clobber:
         plan = without_existing(plan)
     if arguments.resume or arguments.update or shared:
-        plan = without_complete(plan)
+        plan = without_complete(plan, discard=not arguments.dry_run)
     shard = plan.shard(*arguments.shard) if arguments.shard else None
     goes_on = arguments.resume or arguments.no_clobber or shared
     check_plan(plan, anew, [output for output in plan.outputs if goes_on and is_begun(output.path)], shard)
-    if shared:
+    if shared and not (arguments.dry_run and anew):  # it would be removed, not refused
         for output in plan.outputs:
             clear_leftovers(output.path, plan.work(output), anew)
     return plan

@@ -63,13 +63,15 @@ def _onnxruntime_builds(problems: list[str]) -> list[str]:
 
 def _kernel() -> dict[str, Any]:
     """The fused kernel: the paths that run here and the one that is used, or why there is none. It may be missing."""
-    from solidgrain.runtime import ProviderError, load_texture
+    from solidgrain.runtime import ProviderError, SolidgrainError, load_texture
     from solidgrain.runtime.kernel import kernel_paths
 
     try:
         return {"paths": list(kernel_paths()), "used": load_texture(provider="kernel").provider}
     except ProviderError as error:
-        return {"paths": [], "used": None, "reason": str(error)}
+        return {"paths": [], "used": None, "reason": f"{error}; textures are evaluated by ONNX Runtime"}
+    except SolidgrainError as error:  # the embedded texture is damaged: that is among the problems, too
+        return {"paths": [], "used": None, "reason": f"not tried: {error}"}
 
 
 def _providers(problems: list[str]) -> dict[str, str]:
@@ -120,7 +122,7 @@ def _opengl() -> str:
 
 def _kernel_line(kernel: dict[str, Any]) -> str:
     if kernel["used"] is None:
-        return f"{kernel['reason']}; textures are evaluated by ONNX Runtime"
+        return str(kernel["reason"])
     return f"{kernel['used']} is used, of {', '.join(kernel['paths'])}"
 
 

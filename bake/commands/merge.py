@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,16 +42,14 @@ def run(arguments: argparse.Namespace) -> int:
 def find_plan(target: Path) -> Plan:
     """The plan of a file; of an output, the one that its shards were baked for. Raises UsageError."""
     from solidgrain.bake.manifest import manifest_path
-    from solidgrain.bake.schema import load_plan, plan_of
-    from solidgrain.bake.staging import WORK, read_work, staging_folder
+    from solidgrain.bake.schema import load_plan
+    from solidgrain.bake.staging import PLAN, staging_folder
 
     if target.suffix.lower() == ".json":
         return load_plan(target)
-    if (work := staging_folder(target) / WORK).exists():
-        values = read_work(work)
-        output = {**values.get("output", {}), "path": str(target)}
-        described = {key: value for key, value in values.items() if key not in ("output", "slab", "bytes")}
-        return plan_of({**described, "source": values.get("texture"), "outputs": [output]}, str(work))
+    if (kept := staging_folder(target) / PLAN).exists():
+        plan = load_plan(kept)
+        return replace(plan, outputs=tuple(replace(output, path=target.parent / output.path) for output in plan.outputs))
     if manifest_path(target).exists():
         return load_plan(manifest_path(target))
     raise UsageError(f"{target}: no shard of it has been baked here; expected an output with shards, or a plan file")

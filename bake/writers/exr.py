@@ -21,7 +21,7 @@ from solidgrain.bake.color import LINEAR, SRGB, to_half, to_linear
 from solidgrain.bake.frames import frame_paths
 from solidgrain.bake.store import Encoded, Finished, Store
 from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
-from solidgrain.bake.writers.exr_zip import LINES, deflated
+from solidgrain.bake.writers.exr_zip import LINES, deflated, isal_zlib
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.workers import Workers
 
@@ -46,6 +46,8 @@ class ExrStack(Writer):
     def __init__(self, output: Output, volume: Volume, workers: Workers) -> None:
         import OpenEXR
 
+        if output.options["compression"] in LINES:
+            isal_zlib()  # if it is missing, this is told before a voxel is evaluated
         super().__init__(output, volume, workers)
         OpenEXR.set_global_thread_count(0)  # one slice per thread of ours beats its own pool
         self.paths = files(output, volume)

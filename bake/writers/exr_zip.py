@@ -8,10 +8,10 @@ Sources: "OpenEXR File Layout" and "Technical Introduction to OpenEXR" (openexr.
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from isal import isal_zlib
 
 LEVEL = 1  # of 0 to 3; OpenEXR itself uses the like of zlib 4
 LINES = {"zips": 1, "zip": 16}  # scanlines of a chunk
@@ -60,5 +60,12 @@ def pack(lines: ByteArray) -> bytes:
     flat = lines.reshape(-1)
     apart = np.concatenate([flat[0::2], flat[1::2]])
     apart[1:] = apart[1:] - apart[:-1] + np.uint8(128)
-    content: bytes = isal_zlib.compress(apart, LEVEL)
+    content: bytes = isal_zlib().compress(apart, LEVEL)
     return content if len(content) < flat.size else flat.tobytes()
+
+
+def isal_zlib() -> Any:
+    """ISA-L's module. Imported here, because the table of formats imports this file on installations that lack it."""
+    from isal import isal_zlib as module
+
+    return module

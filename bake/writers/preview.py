@@ -38,6 +38,11 @@ class Plane:
     axis: int
     index: int
 
+    def across(self, extents: Sequence[int]) -> tuple[int, int]:
+        """Of the extents along x, y and z, those of the plane's rows and columns."""
+        columns, rows = (extent for axis, extent in enumerate(extents) if axis != self.axis)
+        return rows, columns
+
 
 class PreviewFile(Writer):
     """Keeps six planes of the volume, a stream for each, and draws when the last slab has come."""
@@ -65,10 +70,12 @@ class PreviewFile(Writer):
 
     def assemble(self, store: Store) -> list[Finished]:
         planes = {plane: self._repeated(plane, self._plane(plane, store)) for plane in [*self.middles, *self.faces]}
-        slices = [planes[plane] if plane.axis == 2 else planes[plane][::-1] for plane in self.middles]
-        block = draw_block([planes[plane] for plane in self.faces], self._extents())
+        extents = self._extents()
+        upright = {plane: planes[plane] if plane.axis == 2 else planes[plane][::-1] for plane in self.middles}
+        slices = [fit(picture, plane.across(extents)) for plane, picture in upright.items()]
+        block = draw_block([planes[plane] for plane in self.faces], extents)
         gap = np.full((PANEL, GAP, 3), BACKGROUND, np.float32)
-        panels = [part for picture in [*map(fit, slices), block] for part in (picture, gap)][:-1]
+        panels = [part for picture in [*slices, block] for part in (picture, gap)][:-1]
         staged = store.folder / "preview.png"
         self._write(staged, quantize(np.concatenate(panels, axis=1), np.uint8))
         return [Finished(staged, self.output.path)]
@@ -104,12 +111,15 @@ class PreviewFile(Writer):
         sync(path)
 
 
-def fit(plane: FloatArray) -> FloatArray:
-    """A plane scaled into a panel, nearest sample, its proportions kept, centred."""
-    height, width = plane.shape[:2]
-    scale = PANEL / max(height, width)
-    rows, columns = (np.arange(max(1, round(extent * scale))) for extent in (height, width))
-    scaled = plane[np.minimum((rows / scale).astype(int), height - 1)][:, np.minimum((columns / scale).astype(int), width - 1)]
+def fit(plane: FloatArray, extents: tuple[int, int]) -> FloatArray:
+    """A plane scaled into a panel, nearest sample, centred; its proportions are those of its voxels, `extents` (rows, columns),
+    of which either axis may have been thinned."""
+    scale = PANEL / max(extents)
+    rows, columns = (
+        np.minimum((np.arange(max(1, round(extent * scale))) / scale * (samples / extent)).astype(int), samples - 1)
+        for extent, samples in zip(extents, plane.shape, strict=False)
+    )
+    scaled = plane[rows][:, columns]
     panel = np.full((PANEL, PANEL, 3), BACKGROUND, np.float32)
     top, left = (PANEL - len(rows)) // 2, (PANEL - len(columns)) // 2
     panel[top : top + len(rows), left : left + len(columns)] = scaled

@@ -66,7 +66,7 @@ def kind_of(path: Path) -> str:
     return max(fitting, key=len)
 
 
-def make_output(path: Path, kind: str = "", **options: str | int) -> Output:
+def make_output(path: Path, kind: str = "", /, **options: str | int) -> Output:
     """The output that a file name asks for, every option filled in. Raises UsageError for what no writer knows."""
     kind = kind or kind_of(path)
     row = formats()[kind]

@@ -13,6 +13,8 @@ import OpenImageIO as oiio
 import pytest
 
 from solidgrain.bake import opengl
+from solidgrain.bake.view import read_volume
+from solidgrain.runtime.bundle import embedded_folder
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +24,8 @@ def volume(tmp_path_factory, toy_folder):
     folder = tmp_path_factory.mktemp("volume")
     outputs = ["--out", str(folder / "a.vti"), "--out", str(folder / "a.npy")]
     assert main(["bake", str(toy_folder), "--size", "24x20x16", "--quiet", *outputs]) == 0
+    wide = ["--out", str(folder / "wide.vti"), "--vti-type", "uint16"]
+    assert main(["bake", str(toy_folder), "--size", "24x20x16", "--quiet", *wide]) == 0
     return folder
 
 
@@ -31,8 +35,12 @@ def drawing():
         pytest.skip(f"VTK cannot draw here: {reason}")
 
 
-@pytest.mark.parametrize("mode", ["slices", "volume", "threshold", "block"])
-@pytest.mark.parametrize("name", ["a.vti", "a.npy"])
+MODES = ["slices", "volume", "threshold", "block"]
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"), [("wide.vti", "slices"), *((name, mode) for name in ("a.vti", "a.npy") for mode in MODES)]
+)
 def test_a_screenshot_shows_the_volume_in_colour(solidgrain, drawing, volume, tmp_path, name, mode):
     outcome = solidgrain("view", volume / name, "--mode", mode, "--screenshot", tmp_path / "view.png")
     assert outcome.code == 0, outcome.err
@@ -41,6 +49,22 @@ def test_a_screenshot_shows_the_volume_in_colour(solidgrain, drawing, volume, tm
     assert len(shown) > 0.05 * picture.shape[0] * picture.shape[1]
     assert shown[:, 0].mean() > shown[:, 2].mean()  # the toy texture is reddish
     assert [path.name for path in tmp_path.iterdir()] == ["view.png"]
+
+
+def test_colours_are_the_same_from_numbers_of_any_type(volume, tmp_path):
+    shown = read_volume(volume / "a.vti").point_data["rgb"].astype(int)
+    for dtype in (np.uint8, np.uint16, np.uint32, np.float32, np.float64):
+        largest = np.iinfo(dtype).max if np.issubdtype(dtype, np.integer) else 1
+        np.save(tmp_path / "a.npy", (np.load(volume / "a.npy").astype(float) * largest).astype(dtype))
+        assert np.abs(read_volume(tmp_path / "a.npy").point_data["rgb"] - shown).max() <= 1
+    assert np.abs(read_volume(volume / "wide.vti").point_data["rgb"] - shown).max() <= 1
+
+
+def test_black_and_white_are_exact_in_numbers_of_any_type(tmp_path):
+    for dtype in (np.uint8, np.uint16, np.uint32, np.uint64):
+        ends = np.array([[[[0, 0, 0], [np.iinfo(dtype).max] * 3]]], dtype)
+        np.save(tmp_path / "a.npy", ends)
+        assert read_volume(tmp_path / "a.npy").point_data["rgb"].tolist() == [[0, 0, 0], [255, 255, 255]]
 
 
 def test_without_opengl_there_is_an_error_instead_of_a_crash(solidgrain, volume, tmp_path, monkeypatch):
@@ -123,6 +147,18 @@ def test_doctor_reports_a_healthy_installation(solidgrain):
     assert "OpenGL" in solidgrain("doctor").out
 
 
+def test_doctor_reports_a_damaged_texture_and_all_the_rest(solidgrain, tmp_path, monkeypatch):
+    shutil.copytree(embedded_folder("granite"), tmp_path / "granite")
+    (tmp_path / "granite" / "sampler.onnx").write_bytes(b"damaged")
+    monkeypatch.setattr("solidgrain.runtime.bundle._embedded_root", lambda: tmp_path)
+    outcome = solidgrain("doctor")
+    assert outcome.code == 1
+    assert "kernel     not tried: " in outcome.out
+    assert "PROBLEM    " in outcome.out
+    assert "sampler.onnx" in outcome.out
+    assert "OpenGL" in outcome.out
+
+
 def test_doctor_finds_two_builds_of_onnx_runtime(solidgrain, tmp_path, monkeypatch):
     package = tmp_path / "onnxruntime_gpu-1.0.dist-info"
     package.mkdir()
@@ -133,10 +169,31 @@ def test_doctor_finds_two_builds_of_onnx_runtime(solidgrain, tmp_path, monkeypat
     assert "onnxruntime and onnxruntime-gpu are installed together" in outcome.out
 
 
-def test_a_missing_extra_is_named(tmp_path, toy_folder):
-    code = "import sys; sys.modules['OpenEXR'] = None; from solidgrain.bake.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "bake", str(toy_folder), "--size", "2", "--out", str(tmp_path / "a.#.exr")]
-    outcome = subprocess.run(command, capture_output=True, text=True, check=False)
+def without(package: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """The command line on an installation that lacks a package."""
+    code = f"import sys; sys.modules[{package!r}] = None; from solidgrain.bake.cli import main; sys.exit(main(sys.argv[1:]))"
+    return subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("package", ["OpenEXR", "isal"])
+def test_a_missing_extra_is_named(tmp_path, toy_folder, package):
+    outcome = without(package, "bake", toy_folder, "--size", 2, "--out", tmp_path / "a.#.exr")
     assert outcome.returncode == 1
-    assert outcome.stderr.strip() == "solidgrain: bake needs the package OpenEXR; pip install 'solidgrain[bake]'"
+    assert outcome.stderr.strip() == f"solidgrain: bake needs the package {package}; pip install 'solidgrain[bake]'"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_needs_no_extra_bakes_without(tmp_path, toy_folder):
+    assert "--exr-compression" in without("isal", "bake", "--help").stdout
+    outcome = without("isal", "bake", toy_folder, "--size", 2, "--out", tmp_path / "a.npy", "--quiet")
+    assert (outcome.returncode, outcome.stderr) == (0, "")
+
+
+def test_an_extra_that_a_commands_flags_need_is_named(solidgrain, monkeypatch):
+    def missing(parser):
+        raise ModuleNotFoundError("no module", name="isal.isal_zlib")
+
+    monkeypatch.setattr("solidgrain.bake.commands.bake.add_arguments", missing)
+    outcome = solidgrain("bake", "--help")
+    assert outcome.code == 1
+    assert outcome.error == "solidgrain: bake needs the package isal; pip install 'solidgrain[bake]'"

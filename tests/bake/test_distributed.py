@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +19,10 @@ from pathlib import Path
 import pytest
 from distributed import Client, LocalCluster
 
-from solidgrain.bake import distributed
+from solidgrain import runtime
+from solidgrain.bake import baker, distributed
 from solidgrain.bake.baker import bake
-from solidgrain.bake.distributed import bake_on_cluster
+from solidgrain.bake.distributed import bake_on_cluster, bake_shard
 from solidgrain.bake.plan import Plan
 from solidgrain.bake.staging import open_staging, staging_folder
 from solidgrain.bake.writers import make_output
@@ -142,6 +144,37 @@ def test_what_shards_have_left_is_taken_up_and_what_other_plans_have_left_only_g
         bake_on_cluster(plan, toy, cluster.scheduler_address, 1)
     baked, _ = bake_on_cluster(plan, toy, cluster.scheduler_address, 5, overwrite=True)
     assert baked.reused_slices == 0
+    assert_same_files(tmp_path, whole)
+
+
+def test_a_worker_of_many_threads_loads_once_and_bakes_a_shard_at_a_time(toy, toy_folder, whole, tmp_path, monkeypatch):
+    """Dask starts as many tasks as a worker has threads, all at once."""
+    plan, together, at_work, seen = plan_in(tmp_path, toy, toy_folder), threading.Barrier(4), [], []
+
+    def watched(function):
+        def call(*arguments, **keywords):
+            at_work.append(function)
+            time.sleep(0.05)
+            seen.append(list(at_work))
+            try:
+                return function(*arguments, **keywords)
+            finally:
+                at_work.remove(function)
+
+        return call
+
+    def task(number: int) -> dict:
+        together.wait()
+        return bake_shard(plan.to_json(), number, 4, "auto", 2)
+
+    distributed._texture.cache_clear()
+    monkeypatch.setattr(runtime, "load_texture", watched(runtime.load_texture))
+    monkeypatch.setattr(baker, "bake", watched(baker.bake))
+    with ThreadPoolExecutor(4) as threads:
+        told = list(threads.map(task, range(1, 5)))
+    assert [len(running) for running in seen] == [1] * (1 + 4)
+    assert {one["process"] for one in told} == {os.getpid()}
+    baker.merge(plan, toy.workers)
     assert_same_files(tmp_path, whole)
 
 

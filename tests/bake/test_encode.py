@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import subprocess
 import sys
+import weakref
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +16,9 @@ import OpenImageIO as oiio
 import pytest
 
 from solidgrain.bake.color import to_linear, to_srgb
-from solidgrain.bake.sources import Cut, cut_patch
-from solidgrain.runtime import BundleError, ExemplarError, load, load_space, load_texture
+from solidgrain.bake.evaluate import evaluate
+from solidgrain.bake.sources import Cut, Encoded, cut_patch
+from solidgrain.runtime import BundleError, EvaluationError, ExemplarError, load, load_space, load_texture
 from solidgrain.runtime.texture_file import read_texture
 from solidgrain.train.photograph import scaled
 
@@ -60,22 +64,116 @@ def test_a_photograph_bakes_as_the_texture_that_is_saved_beside_it(solidgrain, t
 
 
 def test_a_dry_run_of_a_photograph_writes_nothing(solidgrain, toy_space_folder, photograph, tmp_path):
-    outcome = solidgrain("bake", photograph, "--bundle", toy_space_folder, "--out", tmp_path / "a.vti", "--dry-run")
+    flags = ("bake", photograph, "--bundle", toy_space_folder, "--size", 4, "--out", tmp_path / "a.vti")
+    outcome = solidgrain(*flags, "--dry-run", "--json")
     assert outcome.code == 0, outcome.err
+    assert f"{tmp_path / 'cliff.sgt.npz'}: is not there yet, and the plan needs it; bake without --dry-run" in outcome.err
     assert list(tmp_path.iterdir()) == []
+    assert solidgrain(*flags, "--quiet").code == 0
+    again = solidgrain(*flags, "--dry-run", "--json", "--update")
+    assert "is not there yet" not in again.err
+    assert json.loads(again.out)["plan"]["source"] == json.loads(outcome.out)["plan"]["source"]
 
 
 def test_a_texture_that_is_there_already_stays(solidgrain, toy_space_folder, photograph, tmp_path):
     flags = ("--bundle", toy_space_folder, "--size", "4", "--quiet", "--out")
     assert solidgrain("bake", photograph, *flags, tmp_path / "a.npy").code == 0
     before = (tmp_path / "cliff.sgt.npz").read_bytes()
-    outcome = solidgrain("bake", photograph, "--crop", "0,0", *flags, tmp_path / "b.npy")
-    assert outcome.code == 1
-    assert "cliff.sgt.npz: exists, and is another texture" in outcome.err
-    assert (tmp_path / "cliff.sgt.npz").read_bytes() == before
-    assert not (tmp_path / "b.npy").exists()
-    assert solidgrain("bake", photograph, "--crop", "0,0", *flags, tmp_path / "b.npy", "--overwrite").code == 0
-    assert (tmp_path / "cliff.sgt.npz").read_bytes() != before
+    for replacing in ((), ("--overwrite",), ("--update",)):  # these are about outputs
+        outcome = solidgrain("bake", photograph, "--crop", "0,0", *flags, tmp_path / "b.npy", *replacing)
+        assert outcome.code == 1
+        assert "cliff.sgt.npz: exists, and is another texture than" in outcome.err
+        assert (tmp_path / "cliff.sgt.npz").read_bytes() == before
+        assert not (tmp_path / "b.npy").exists()
+    assert solidgrain("bake", photograph, *flags, tmp_path / "a.npy", "--overwrite").code == 0
+    (tmp_path / "cliff.sgt.npz").write_bytes(b"damaged, or of another kind")
+    assert "is another texture than" in solidgrain("bake", photograph, *flags, tmp_path / "a.npy", "--overwrite").err
+
+
+@pytest.mark.parametrize("error", [EvaluationError("damaged"), KeyboardInterrupt()])
+def test_a_bake_that_fails_leaves_no_texture_unless_it_can_be_resumed(
+    solidgrain, toy_space_folder, photograph, tmp_path, monkeypatch, error
+):
+    def fail(*arguments):
+        raise error
+
+    monkeypatch.setattr("solidgrain.bake.baker.evaluate", fail)
+    flags = ("bake", photograph, "--bundle", toy_space_folder, "--size", "4", "--quiet", "--out", tmp_path / "a.npy")
+    assert solidgrain(*flags).code in (1, 130)
+    assert list(tmp_path.iterdir()) == []
+    assert solidgrain(*flags, "--resume").code in (1, 130)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".a.npy.baking", "cliff.sgt.npz"]
+    monkeypatch.undo()
+    assert solidgrain(*flags, "--resume").code == 0
+    monkeypatch.setattr("solidgrain.bake.baker.evaluate", fail)
+    assert solidgrain(*flags, "--overwrite", "--seed", 1).code in (1, 130)
+    assert (tmp_path / "cliff.sgt.npz").is_file()  # it was there before
+
+
+def test_a_texture_is_kept_if_one_of_its_jobs_is_baked(solidgrain, toy_space_folder, photograph, tmp_path, monkeypatch):
+    good, folder = {"texture": str(photograph), "bundle": str(toy_space_folder), "size": 4}, tmp_path / "other"
+    folder.mkdir()
+    jobs = [{"name": "a", **good, "out": "a.npy"}, *({"name": n, **good, "out": n} for n in ("b.npy", "other/c.npy"))]
+    (tmp_path / "jobs.json").write_text(json.dumps({"jobs": jobs}))
+    monkeypatch.setattr("solidgrain.bake.baker.evaluate", _only_for("a.npy", evaluate))
+    assert solidgrain("bake", "--jobs", tmp_path / "jobs.json", "--continue-on-error", "--quiet").code == 1
+    assert (tmp_path / "cliff.sgt.npz").is_file()
+    assert list(folder.iterdir()) == []
+
+
+def _only_for(name, evaluate):
+    """`evaluate` that fails for other outputs."""
+
+    def fail_for_others(plan, *arguments):
+        if plan.outputs[0].path.name != name:
+            raise EvaluationError("damaged")
+        return evaluate(plan, *arguments)
+
+    return fail_for_others
+
+
+def test_jobs_of_one_photograph_have_their_own_precision_and_one_space(toy_space_folder, photograph, tmp_path, monkeypatch):
+    """As if every processor had bfloat16: the textures say which they were asked for, and are evaluated in float32."""
+    loaded = []
+
+    def load_recorded(source, *, provider, precision, threads):
+        loaded.append(precision)
+        return load_space(source, provider=provider, threads=threads)
+
+    monkeypatch.setattr("solidgrain.bake.sources.load_space", load_recorded)
+    named = {"bundle": str(toy_space_folder), "provider": "auto", "threads": 1, "patch_scale": None, "crop": None}
+    named |= {"source": str(photograph), "out": [tmp_path / "a.npy"], "preview": None}
+    jobs = [Namespace(**named, precision=precision) for precision in (None, "bfloat16", "float32", "bfloat16")]
+    encoded = Encoded()
+    for job in jobs:
+        encoded.settle(job)
+    assert loaded == ["float32", "bfloat16"]
+    textures = [encoded.load(job) for job in jobs]
+    assert textures[0] is textures[2]
+    assert textures[1] is textures[3]
+    assert textures[0] is not textures[1]
+    kept = weakref.ref(textures[0])
+    del textures
+    encoded.save()
+    gc.collect()
+    assert kept() is None  # the jobs alone hold on to what they bake
+    assert read_texture(tmp_path / "cliff.sgt.npz").name == "cliff"
+
+
+def test_an_embedded_space_is_named_wherever_a_bundle_is(solidgrain, photograph, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    flags = ("--bundle", "stone", "--size", 4, "--quiet", "--out")
+    assert solidgrain("bake", photograph, *flags, "a.npy").code == 0
+    assert solidgrain("bake", "cliff.sgt.npz", *flags, "b.npy").code == 0
+    assert json.loads(Path("a.npy.bake.json").read_text())["plan"]["bundle"] == "stone"
+    for name in ("a.npy", "b.npy"):
+        assert solidgrain("verify", name).code == 0
+    assert solidgrain("bake", "--plan", "a.npy.bake.json", "--overwrite", "--quiet").code == 0
+    job = {"name": "c", "texture": "cliff.sgt.npz", "bundle": "stone", "size": 4, "out": "c.npy"}
+    Path("jobs.json").write_text(json.dumps({"jobs": [job]}))
+    outcome = solidgrain("bake", "--jobs", "jobs.json", "--quiet")
+    assert outcome.code == 0, outcome.err
+    assert np.array_equal(np.load("a.npy"), np.load("c.npy"))
 
 
 def test_a_job_file_takes_photographs(solidgrain, toy_space_folder, photograph, tmp_path):

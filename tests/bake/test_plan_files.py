@@ -126,6 +126,8 @@ def saved(toy, tmp_path, **changes) -> tuple[Path, dict]:
         ),
         ({"outputs": [{"path": "a.vti", "kind": ".vti", "options": {"type": "int4"}}]}, "type 'int4', expected one of uint8"),
         ({"outputs": [{"path": "a.vti", "kind": ".vti", "options": {"bits": 4}}]}, "unknown option 'bits' of vti"),
+        ({"outputs": [{"path": "a.vti", "kind": ".vti", "options": {"kind": ".npy"}}]}, "unknown option 'kind' of vti"),
+        ({"outputs": [{"path": "a.vti", "kind": ".vti", "options": {"path": "b.vti"}}]}, "unknown option 'path' of vti"),
         ({"outputs": [{"path": "a.vti", "kind": ".vti", "options": {"dither": "no"}}]}, "dither: expected a whole number"),
         ({"outputs": [{"path": "a.vti", "kind": ".vti", "options": {"type": []}}]}, "type: expected a text or a whole number"),
     ],
@@ -257,6 +259,44 @@ def test_a_plan_bakes_in_shards_and_merges_by_its_file_or_its_output(solidgrain,
         assert again.code == 0
         assert "nothing to merge" in again.err
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.npy", "a.npy.bake.json", "plan.json"]
+
+
+@pytest.fixture
+def other_texture(toy, toy_folder, tmp_path):
+    """A texture file that has neither its texture's name nor its bundle's folder."""
+    folder = tmp_path / "textures"
+    folder.mkdir()
+    toy.save(folder / "mine.sgt.npz")
+    return folder / "mine.sgt.npz"
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_merge_by_one_output_has_all_of_the_plan(solidgrain, other_texture, toy_folder, tmp_path, monkeypatch, moved):
+    """Shards are baked with relative names; the merge is called elsewhere, and the files may lie elsewhere by then."""
+    for name in ("work", "work/out", "work/slices", "elsewhere"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    flags = ("bake", "../textures/mine.sgt.npz", "--bundle", toy_folder, "--size", "6x5x40")
+    flags += ("--out", "out/a.vti", "--out", "out/b.npy")
+    flags += () if moved else ("--out", "slices/c.###.exr")
+    for share in ("1/2", "2/2"):
+        assert solidgrain(*flags, "--shard", share).code == 0
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    folder = tmp_path / "work/out"
+    if moved:
+        folder = folder.rename(tmp_path / "moved")
+    report = json.loads(solidgrain("merge", folder / "b.npy", "--json", "--quiet").out)
+    outputs = [folder / "a.vti", folder / "b.npy", *([] if moved else [tmp_path / "work/slices/c.###.exr"])]
+    assert [output["path"] for output in report["plan"]["outputs"]] == [str(path) for path in outputs]
+    assert len(report["files"]) == 2 + (0 if moved else 40)
+    for output in outputs:
+        manifest = json.loads(output.with_name(f"{output.name}.bake.json").read_text())
+        assert manifest["plan"] == report["plan"]
+        assert Path(manifest["plan"]["source"]).samefile(other_texture)
+        assert Path(manifest["plan"]["bundle"]).samefile(toy_folder)
+    assert solidgrain("verify", *outputs).code == 0
+    assert solidgrain("bake", "--plan", f"{outputs[0]}.bake.json", "--overwrite").code == 0
+    assert sorted(path.name for path in folder.iterdir()) == ["a.vti", "a.vti.bake.json", "b.npy", "b.npy.bake.json"]
 
 
 def test_merge_keeps_a_file_that_was_there_unless_told_otherwise(solidgrain, toy, toy_folder, tmp_path):

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from solidgrain.bake.baker import bake, merge
+from solidgrain.bake.schema import load_plan
 from solidgrain.bake.staging import open_staging, staged_bytes, staging_folder
 from solidgrain.bake.writers import PREVIEW, make_output
 from solidgrain.runtime import BakeError
@@ -417,6 +418,43 @@ def test_resume_update_and_shards_on_the_command_line(solidgrain, tmp_path, toy_
     assert contents(tmp_path) == first
     assert solidgrain("bake", toy_folder, "--size", "6x5x41", "--out", "a.npy", "--update").code == 0
     assert (tmp_path / "a.npy").stat().st_size == 128 + 6 * 5 * 41 * 12
+
+
+def test_a_share_without_slabs_is_said_to_be_empty(solidgrain, tmp_path, toy_folder):
+    flags = ("bake", toy_folder, "--size", "6x5x40", "--out", tmp_path / "a.vti", "--shard", "1/8")
+    outcome = solidgrain(*flags, "--json")
+    assert outcome.code == 0
+    assert outcome.error == "toy: no slabs in this share"
+    assert json.loads(outcome.out)["files"] == []
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("flag", ["--update", "--resume"])
+def test_a_plan_that_is_done_leaves_the_shards_of_another_alone(solidgrain, tmp_path, toy_folder, flag):
+    flags = ("bake", toy_folder, "--size", "6x5x40", "--out", tmp_path / "a.npy", "--quiet")
+    assert solidgrain(*flags).code == 0
+    assert solidgrain(*flags, "--seed", 1, "--shard", "1/2", "--overwrite").code == 0
+    assert solidgrain(*flags, flag).code == 0
+    report = json.loads(solidgrain(*flags, "--seed", 1, "--resume", "--overwrite", "--json").out)
+    assert report["reused_slices"] == 16
+
+
+def test_a_dry_run_removes_nothing(solidgrain, tmp_path, toy_folder):
+    flags = ("bake", toy_folder, "--size", "6x5x40", "--out", tmp_path / "a.npy", "--quiet")
+    assert solidgrain(*flags).code == 0
+    plan = load_plan(tmp_path / "a.npy.bake.json")
+    open_staging(tmp_path / "a.npy", plan.work(plan.outputs[0]), 40, 0, None, fresh=True).close()  # as a kill leaves it
+    staging = staging_folder(tmp_path / "a.npy")
+    assert solidgrain(*flags, "--update", "--dry-run").code == 0
+    assert staging.exists()
+    assert solidgrain(*flags, "--update").code == 0
+    assert not staging.exists()
+    assert solidgrain(*flags, "--seed", 1, "--shard", "1/2", "--overwrite").code == 0
+    before = contents(staging)
+    assert solidgrain(*flags, "--shard", "1/2", "--overwrite", "--seed", 2, "--dry-run").code == 0
+    assert contents(staging) == before
+    (tmp_path / "a.npy").unlink()
+    assert "an unfinished bake of another plan" in solidgrain(*flags, "--seed", 2, "--shard", "1/2", "--dry-run").error
 
 
 @pytest.fixture

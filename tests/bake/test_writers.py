@@ -6,7 +6,9 @@ The volume has three different extents and a random texture, which has no symmet
 from __future__ import annotations
 
 import os
+import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import OpenEXR
@@ -18,8 +20,10 @@ from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
 from solidgrain.bake.baker import bake
 from solidgrain.bake.color import to_linear
-from solidgrain.bake.plan import Plan
-from solidgrain.bake.writers import PREVIEW, Output, make_output
+from solidgrain.bake.plan import BASE_MEMORY, Plan
+from solidgrain.bake.store import Store
+from solidgrain.bake.writers import PREVIEW, Output, Volume, make_output, open_writer
+from solidgrain.runtime.workers import Workers
 
 SIZE = (7, 5, 19)  # x, y, z: more slices than one slab
 ORIGIN, SPACING = (10.0, -20.0, 1000.0), (1.0, 0.5, 2.0)
@@ -196,6 +200,61 @@ def test_the_preview_of_a_tile_shows_its_repeats(toy, tmp_path):
     assert np.array_equal(across_z[:192, :192], across_z[192:, 192:])
     assert np.array_equal(across_y[:, :192], across_y[:, 192:])
     assert not np.array_equal(across_y[:192], across_y[192:])
+
+
+@pytest.mark.parametrize(
+    ("size", "tile", "rows", "columns"),
+    [
+        ((1024, 4, 256), "", 96, 384),
+        ((600, 4, 512), "", 328, 384),
+        ((512, 4, 600), "", 384, 328),
+        ((1024, 4, 256), "z", 192, 384),
+    ],
+)
+def test_a_preview_has_the_proportions_of_the_volume_however_it_was_thinned(tmp_path, size, tile, rows, columns):
+    """The slice across y of a volume that is bright, brighter towards its middle x: more than 512 voxels are thinned."""
+    volume = Volume(size[::-1], ORIGIN, SPACING, "toy", "", 0, tile)
+    writer, store = open_writer(make_output(tmp_path / "a.png", PREVIEW), volume, Workers(1)), Store(tmp_path, size[2])
+    ramp = 1 - 0.8 * np.abs(np.linspace(-1, 1, size[0], dtype=np.float32))
+    store.append(0, size[2], writer.encode(0, np.broadcast_to(ramp[:, None], (*volume.shape, 3))))
+    picture = oiio.ImageBuf(os.fspath(writer.assemble(store)[0].staged)).get_pixels(oiio.FLOAT)
+    panel = picture[:, 396:780, 0]
+    shown = panel > 0.15  # the background is darker
+    assert (shown.any(1).sum(), shown.any(0).sum()) == (rows, columns)
+    assert shown.sum() == rows * columns
+    expected_columns = np.interp(np.arange(columns) / columns * size[0], np.arange(size[0]), ramp)
+    assert np.abs(panel[192, shown[192]] - expected_columns).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "samples"),
+    [
+        ("a.####.exr", {}, 1),
+        ("a.####.exr", {"compression": "piz", "channels": "R=r,G=g,B=b,height=luma"}, 1),
+        ("a.vti", {"type": "uint16", "dither": 1, "compression": "zlib"}, 1),
+        ("a.vdb", {"type": "float"}, 1),
+        ("a.####.exr", {}, 8),
+        ("a.raw", {"dither": 1}, 8),
+    ],
+)
+def test_a_bake_of_large_slices_holds_no_more_than_the_plan_says(tmp_path, monkeypatch, name, options, samples):
+    """Slabs of one slice, which a thread has to itself; the texture costs nothing."""
+
+    def slabs(shape, seed, slab, slices, **place):
+        return ((z, np.full((slab, *shape[1:], 3), 0.5, np.float32)) for z in range(*slices, slab))
+
+    monkeypatch.setattr("solidgrain.bake.plan.SLAB_BYTES", 1)
+    texture = SimpleNamespace(slabs=slabs, workers=Workers(2), data=SimpleNamespace(sha256="0" * 64, sampler_sha256="0" * 64))
+    side = 512 if samples == 1 else 192
+    plan = plan_for(texture, make_output(tmp_path / name, **options), size=(side, side, 5), samples=samples)
+    assert plan.slab == 1
+    tracemalloc.start()
+    try:
+        bake(plan, texture)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak <= plan.memory - BASE_MEMORY
 
 
 def test_a_nan_leaves_nothing_behind(toy, tmp_path, monkeypatch):
