@@ -10,6 +10,7 @@ import base64
 import struct
 import textwrap
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -31,7 +32,7 @@ PANEL = 256  # pixels along each side of a picture: at most of the exemplar, at 
 ENLARGED = 6  # screen pixels per pixel of a patch
 GAP, LINE, LETTER = 16, 24, 15  # screen pixels between pictures, from one line of text to the next, and of a letter's height
 LABELS, TABLE = "DroidSans", "DroidSansMono"  # fonts that OpenImageIO brings along
-COLUMN = 22  # letters
+BETWEEN = 3  # letters, the columns of the table
 STYLE = """
 body { font: 15px sans-serif; margin: 2em; max-width: 1150px }
 figure { display: inline-block; margin: 0 1em 1em 0 }
@@ -131,7 +132,7 @@ def as_png(pixels: Pixels) -> bytes:
 def _drawn(sheet: Sheet) -> Pixels:
     """The sheet as one picture."""
     figures = sheet.figures
-    table = ["".join(cell.ljust(COLUMN) for cell in row) for row in (figures.header, *figures.rows)]
+    table = aligned((figures.header, *figures.rows))
     width = max(sum(picture.shape[1] + GAP for _, picture in row) for row in sheet.rows) + GAP
     page = Page(width)
     page.write([sheet.title], LABELS)
@@ -145,6 +146,12 @@ def _drawn(sheet: Sheet) -> Pixels:
     page.write(table, TABLE)
     page.write(textwrap.wrap(figures.after, letters), LABELS)
     return page.pixels()
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The rows of a table as lines, each column as wide as its widest cell and a gap."""
+    widths = [max(map(len, column)) + BETWEEN for column in zip(*rows, strict=True)]
+    return ["".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
 
 
 class Page:

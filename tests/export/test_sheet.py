@@ -19,7 +19,7 @@ pytest.importorskip(
 import OpenImageIO as oiio
 
 from solidgrain.export.figures import Figures
-from solidgrain.export.sheet import as_html, as_png, make_sheet, write_sheet
+from solidgrain.export.sheet import aligned, as_html, as_png, make_sheet, write_sheet
 from solidgrain.runtime.errors import SolidgrainError
 from solidgrain.train.copying import Pair
 from tests.train.conftest import blotches
@@ -168,3 +168,8 @@ def test_a_sheet_that_makes_no_sense_is_refused_before_measuring(solidgrain, toy
     outcome = solidgrain("evaluate", toy_folder, "--exemplar", tmp_path / "exemplar.png", "--sheet", tmp_path / name)
     assert outcome.code == 2
     assert message in outcome.error
+
+
+def test_columns_of_the_table_never_touch():
+    lines = aligned([("measure", "exemplar turned by 90°", "last"), ("gram", "1.00", "2")])
+    assert lines == ["measure   exemplar turned by 90°   last   ", "gram      1.00                     2      "]
