@@ -45,6 +45,7 @@ class Ending(NamedTuple):
 
     iteration: int
     saved: bool  # not if that state is in doubt
+    report: Report | None  # the last, if there was an iteration to do
 
 
 class Trainer:
@@ -257,7 +258,7 @@ def train(
     trainer.load()
     if processes.first:
         run.rewind_stats(trainer.iteration)
-    settings = run.settings
+    settings, report = run.settings, None
     onlooker = _call_onlooker(trainer) if budget.until_plateau else None
 
     while not budget.done(trainer.iteration, trainer.seconds) and not processes.any(should_stop()):
@@ -291,7 +292,7 @@ def train(
         if doubt:
             on_warning(f"iteration {trainer.iteration} is not saved ({doubt}); the last checkpoint stays")
         _write_sample(trainer)
-    return Ending(trainer.iteration, not doubt)
+    return Ending(trainer.iteration, not doubt, report)
 
 
 def _call_onlooker(trainer: Trainer) -> Onlooker:

@@ -156,7 +156,7 @@ def test_the_command_line_makes_one_run_for_both_processes_and_says_so_once(fold
 def test_an_interrupt_of_any_process_stops_all_of_them_at_one_iteration(folder, found):
     assert [process["interrupted"] for process in found] == [130, 130]
     stopped = said((folder / "stderr").read_text())[2:]
-    assert stopped == [f"stopped and saved; go on with: solidgrain train --resume {folder}/run"]
+    assert stopped == [f"stopped and saved; go on with: solidgrain train --resume {folder}/run --iterations 1000"]
     assert open_space_run(folder / "run").load_checkpoint()["iteration"] == 3
 
 

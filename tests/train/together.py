@@ -59,13 +59,13 @@ def weights(trainer):
 
 
 def trained(folder: Path, processes: Processes, *sittings: int):
-    reports = [
+    endings = [
         train(open_space_run(folder), Budget(iterations=until), CPU, processes=processes, on_report=lambda report: None)
         for until in sittings
     ]
     trainer = Trainer(open_space_run(folder), CPU, processes)
     trainer.load()
-    return {"weights": weights(trainer), "stream": trainer.generator.get_state(), "style": reports[-1].style}
+    return {"weights": weights(trainer), "stream": trainer.generator.get_state(), "style": endings[-1].report.style}
 
 
 def interrupt_itself(after: int) -> None:
