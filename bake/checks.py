@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from pathlib import Path
 
 from solidgrain.bake.manifest import is_complete, manifest_path, own_manifest
 from solidgrain.bake.plan import Plan, format_bytes, format_size
-from solidgrain.bake.staging import WORK, discard_staging, is_begun, read_work, staged_bytes, staging_folder
+from solidgrain.bake.staging import discard_staging, is_begun, is_foreign, staged_bytes, staging_folder
 from solidgrain.bake.writers import Output, check_output, output_bytes, output_exists, output_files, scratch_bytes
 from solidgrain.runtime.errors import BakeError, UsageError
 
@@ -49,7 +48,7 @@ def without_complete(plan: Plan, discard: bool = True) -> Plan:
     """
     complete = {output.path: output for output in plan.outputs if is_complete(plan, output)}
     for path, output in complete.items():
-        if discard and _is_own(plan, output):
+        if discard and not is_foreign(path, plan.work(output)):
             discard_staging(path)
     return replace(plan, outputs=tuple(output for output in plan.outputs if output.path not in complete))
 
@@ -59,12 +58,6 @@ def leaves_nothing(plan: Plan) -> bool:
     return bool(plan.outputs) and not any(
         staging_folder(output.path).exists() or own_manifest(plan, output) for output in plan.outputs
     )
-
-
-def _is_own(plan: Plan, output: Output) -> bool:
-    """Whether the staging of an output is this plan's. One that has lost its name is nobody's, and nobody will miss it."""
-    path = staging_folder(output.path) / WORK
-    return not path.exists() or read_work(path) == json.loads(json.dumps(plan.work(output)))
 
 
 def _check_file(path: Path, overwrite: bool, taken: set[Path]) -> None:

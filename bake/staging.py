@@ -203,11 +203,16 @@ def discard_staging(output: Path) -> None:
 
 def clear_leftovers(output: Path, work: dict[str, Any], overwrite: bool) -> None:
     """Remove an unfinished bake of another plan that is in the way of shards, or refuse to. Raises BakeError."""
-    path = staging_folder(output) / WORK
-    if path.exists() and overwrite and read_work(path) != json.loads(json.dumps(work)):
+    if overwrite and is_foreign(output, work):
         discard_staging(output)
-    elif path.exists():
+    elif (staging_folder(output) / WORK).exists():
         check_work(output, work)
+
+
+def is_foreign(output: Path, work: dict[str, Any]) -> bool:
+    """Whether an unfinished bake of another plan lies beside an output. One that has lost its name is nobody's."""
+    path = staging_folder(output) / WORK
+    return path.exists() and read_work(path) != json.loads(json.dumps(work))
 
 
 def open_staging(

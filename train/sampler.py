@@ -13,6 +13,7 @@ from solidgrain.train.settings import Settings
 
 HIDDEN_LAYERS = 5
 NARROWEST = 0.02  # of the largest deviation of an exemplar's colours, the least that is told apart along any axis
+COLORS = ("color_mean", "color_axes")  # of a sampler's state, what its output is relative to
 BINS = 4  # consecutive bins of octaves; bin l enters hidden layer l, the last hidden layer gets none
 
 
@@ -132,7 +133,7 @@ def make_sampler(settings: Settings, generator: torch.Generator) -> Sampler | No
 
 def _keep_own_colors(sampler: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
     """States of earlier versions have no colours: they computed them from the exemplar whenever they were read."""
-    for name in ("color_mean", "color_axes"):
+    for name in COLORS:
         state.setdefault(prefix + name, getattr(sampler, name))
 
 

@@ -11,9 +11,8 @@ from torch import Tensor, nn
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.train.loop import Trainer
 from solidgrain.train.run import RunFolder, is_space, open_run, read_checkpoint
+from solidgrain.train.sampler import COLORS
 from solidgrain.train.space_run import open_space_run
-
-COLORS = ("color_mean", "color_axes")  # what S's output is relative to
 
 
 def learned(other: Path) -> dict[str, Any]:
