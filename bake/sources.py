@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -43,12 +44,17 @@ def is_photograph(source: str) -> bool:
 
 
 def open_in_space(space: Space, source: str, cut: Cut = WHERE_IT_IS, on_note: Note = _silent) -> Texture:
-    """A texture file of a space, or the texture of a photograph. Raises BundleError or ExemplarError."""
+    """A texture file of a space, which lies at one place of it, or the texture of a photograph.
+
+    Raises UsageError, BundleError or ExemplarError.
+    """
     if is_photograph(source):
         return encode_photograph(space, Path(source), cut, on_note)
     if cut != WHERE_IT_IS:
         raise UsageError(f"--patch-scale and --crop: are about photographs, {source} is a texture file; leave them out")
-    return space.open(read_texture(Path(source)))
+    if not Path(source).is_file():
+        raise UsageError(f"{source}: no such file; expected a texture file ({TEXTURE_SUFFIX}) or a photograph")
+    return space.open(space.owned(read_texture(Path(source))))
 
 
 def encode_photograph(space: Space, path: Path, cut: Cut = WHERE_IT_IS, on_note: Note = _silent) -> Texture:
@@ -61,7 +67,7 @@ def encode_photograph(space: Space, path: Path, cut: Cut = WHERE_IT_IS, on_note:
         on_note(f"warning: {path}: {photograph.warning}")
     patch, note = cut_patch(photograph.pixels, space.patch, cut, str(path))
     on_note(note)
-    return space.encode(patch, path.stem)
+    return space.encode(patch, path.stem, cut.scale or 1.0)
 
 
 def check_new(file: Path, overwrite: bool) -> None:
@@ -172,7 +178,7 @@ def cut_patch(pixels: FloatArray, size: int, cut: Cut, name: str) -> tuple[Float
     if side > min(height, width):
         raise ExemplarError(
             f"{name}: {width}x{height} pixels, expected at least {side}x{side} ({size} at --patch-scale {scale:g}); "
-            f"use a larger photograph or --patch-scale {min(height, width) / size:.2g}"
+            f"use a larger photograph or --patch-scale {math.floor(100 * min(height, width) / size) / 100:g}"
         )
     left, top = cut.corner if cut.corner else ((width - side) // 2, (height - side) // 2)
     if left + side > width or top + side > height:

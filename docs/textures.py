@@ -24,10 +24,11 @@ from solidgrain.runtime import SolidgrainError, UsageError, load_texture
 from solidgrain.runtime.bundle import Bundle
 from solidgrain.runtime.files import replacing
 from solidgrain.train.copying import Copying
+from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
 from solidgrain.train.quality import Evaluation
 from solidgrain.train.vgg import find_weights
 
-Found = dict[str, Any]  # what `solidgrain evaluate --json` prints, and `files`
+Found = dict[str, Any]  # what `solidgrain evaluate --json` prints, `files`, and the photograph's `nonstationarity`
 PAGE, DATA = "textures.md", "textures.json"
 INTRODUCTION = """\
 # The embedded textures
@@ -59,7 +60,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         texture = load_texture(bundles[name].folder, threads=arguments.threads)
         measured = measure(texture, photograph, arguments.slices)
         write_quality(texture, measured.figures)
-        found[name] = {"files": bundles[name].manifest["files"], **measured.as_json()}
+        files = {"files": bundles[name].manifest["files"], "nonstationarity": nonstationarity(photograph)}
+        found[name] = files | measured.as_json()
         write_results(arguments.out, bundles, found)
     write_results(arguments.out, bundles, found)
 
@@ -125,8 +127,10 @@ def section(name: str, bundle: Bundle, found: Found | None) -> str:
     training, grain = bundle.manifest["training"], grain_of(bundle)
     size = sum(path.stat().st_size for path in bundle.folder.iterdir())
     turned = "turned freely" if grain == "none" else f"turned about the {grain} axis only"
+    uneven = (found or {}).get("nonstationarity", 0)
+    change = f"; changes across itself: nonstationarity {uneven:.2f}, above {NONSTATIONARY}" if uneven > NONSTATIONARY else ""
     facts = [
-        f"- photograph: {photograph}, licence {license}, credit {credit}",
+        f"- photograph: {photograph}, licence {license}, credit {credit}{change}",
         f"- training: {training['iterations']:,} iterations, {training['minutes']:g} minutes; slices {turned}",
         f"- bundle: {size / 1024:.0f} KB; {bundle.manifest['octaves']} octaves, {bundle.manifest['width']} units a layer",
     ]
@@ -135,7 +139,7 @@ def section(name: str, bundle: Bundle, found: Found | None) -> str:
 
 def quality(found: Found) -> str:
     """The table of `solidgrain evaluate`."""
-    evaluation = {key: value for key, value in found.items() if key not in ("files", "copying")}
+    evaluation = {key: value for key, value in found.items() if key not in ("files", "nonstationarity", "copying")}
     return make_figures(Evaluation(**evaluation), Copying(**found["copying"])).markdown()
 
 

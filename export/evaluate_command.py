@@ -18,7 +18,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("source", metavar="SOURCE", help="embedded name, bundle or texture file")
     add("--bundle", metavar="FOLDER", help="the bundle of a texture file")
     add("--exemplar", type=Path, required=True, metavar="PHOTO", help="the photograph that it was trained on")
-    add("--patch-scale", type=parse_scale, metavar="S", help="photograph's pixels per exemplar pixel (as it was trained)")
+    add(
+        "--patch-scale",
+        type=parse_scale,
+        metavar="S",
+        help="photograph's pixels per exemplar pixel (as it was trained or encoded)",
+    )
     add(
         "--slices", type=parse_positive, default=50, metavar="N", help="axis-aligned and oblique slices, one instance each (50)"
     )
@@ -30,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from solidgrain.export.evaluation import grain_of, measure, scale_of, write_quality
+    from solidgrain.export.evaluation import exemplar_scale, grain_of, measure, write_quality
     from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load_texture
     from solidgrain.train.inception import Inception
@@ -43,9 +48,10 @@ def run(arguments: argparse.Namespace) -> int:
     texture = load_texture(arguments.source, bundle=arguments.bundle, threads=arguments.threads)
     if arguments.card and texture.bundle.is_space:
         raise UsageError(f"--card: {texture.bundle.name} is a space, its card not that of one texture; leave --card out")
-    scale = arguments.patch_scale or scale_of(texture.bundle)
+    scale = arguments.patch_scale or exemplar_scale(texture)
     exemplar = read_exemplar(arguments.exemplar, SMALLEST, scale)
-    print(f"measuring {2 * arguments.slices} slices of {texture.name}", file=sys.stderr)
+    reduced = "" if scale == 1 else f", of whose pixels {scale:g}x{scale:g} are one"
+    print(f"measuring {2 * arguments.slices} slices of {texture.name} against {arguments.exemplar}{reduced}", file=sys.stderr)
     found = measure(texture, exemplar, arguments.slices, inception)
     figures = found.figures
     print(json.dumps(found.as_json(), indent=2) if arguments.json else figures.markdown())

@@ -10,6 +10,7 @@ from solidgrain.export.figures import Figures, make_figures
 from solidgrain.runtime import Texture
 from solidgrain.runtime.bundle import CARD, Bundle
 from solidgrain.runtime.files import replacing
+from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.copying import Copying, Pair, measure_copying
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
@@ -40,6 +41,12 @@ def scale_of(bundle: Bundle) -> float:
     """How many pixels of the photograph were one of the exemplar that a texture was learned from; 1 for a space."""
     entries = bundle.manifest["training"].get("exemplars", [])
     return float(entries[0].get("scale", 1.0)) if len(entries) == 1 else 1.0
+
+
+def exemplar_scale(texture: Texture) -> float:
+    """How many pixels of its photograph are one of a texture's: as it was trained, or encoded."""
+    data = texture.data
+    return data.scale if texture.bundle.is_space and isinstance(data, TextureData) else scale_of(texture.bundle)
 
 
 def measure(texture: Texture, exemplar: FloatArray, slices: int, inception: Inception | None = None) -> Measured:

@@ -9,7 +9,10 @@ Runtime, and the reason is there to be asked for. Two environment variables, for
 
 from __future__ import annotations
 
+import base64
+import csv
 import ctypes
+import hashlib
 import os
 import struct
 from collections.abc import Sequence
@@ -30,8 +33,8 @@ from solidgrain.runtime.workers import Task
 ABI = 1  # SOLIDGRAIN_ABI of native/kernel.h
 PATHS = ("amx", "avx512", "avx2", "portable")
 BFLOAT16_PATHS = ("amx",)
-BRICKS_PER_TASK = 4  # 16 384 voxels: some milliseconds, a fifth of a second on the slowest path
-POINTS_PER_TASK = 16384
+BRICK = 4096  # voxels
+WORK_PER_TASK = 4 * BRICK * 128**2  # points times squared width: some milliseconds, a fifth of a second on the slowest path
 STEEPEST = 2.0**13  # texels per pixel: times the farthest point, below 2^53
 
 FloatArray = npt.NDArray[np.float32]
@@ -91,6 +94,7 @@ class KernelEngine:
         if np.abs(texture.transforms).sum(2).max() > STEEPEST:
             raise KernelMissingError(f"an octave has more than {STEEPEST:g} texels per pixel")
         self.texture, self.folded = texture, fold(list(weights), texture)
+        self.bricks_per_task = max(1, min(4, WORK_PER_TASK // (BRICK * texture.gamma.shape[1] ** 2)))
         self.library = _library(_library_file())
         self.name = f"kernel:{self.path}"
 
@@ -118,7 +122,7 @@ class KernelInstance:
         description = _Description(octaves, width, layers, engine.precision == "bfloat16", any(tiling.period))
         for name, array in arrays.items():
             setattr(description, name, array.ctypes.data)
-        self.library, self.name = engine.library, texture.name
+        self.library, self.name, self.bricks_per_task = engine.library, texture.name, engine.bricks_per_task
         self.handle: int | None = self.library.solidgrain_open(ctypes.byref(description), engine.path.encode())
         if not self.handle:
             raise EvaluationError(f"{self.name}: not enough memory for the fused kernel")
@@ -129,14 +133,14 @@ class KernelInstance:
 
     def point_tasks(self, points: DoubleArray, rgb: FloatArray) -> list[Task]:
         """Calls that fill `rgb` [P, 3] with the colours of points [P, 3], in any order, in any threads."""
-        starts = range(0, len(points), POINTS_PER_TASK)
-        return [partial(self._points, points[k : k + POINTS_PER_TASK], rgb[k : k + POINTS_PER_TASK]) for k in starts]
+        count = BRICK * self.bricks_per_task
+        return [partial(self._points, points[k : k + count], rgb[k : k + count]) for k in range(0, len(points), count)]
 
     def grid_tasks(self, x: DoubleArray, y: DoubleArray, z: DoubleArray, rgb: FloatArray) -> list[Task]:
         """The same for the product of coordinates along each axis, `rgb` [len(z), len(y), len(x), 3]."""
         bricks = self.library.solidgrain_bricks(len(x), len(y), len(z))
-        starts = range(0, bricks, BRICKS_PER_TASK)
-        return [partial(self._bricks, x, y, z, k, min(BRICKS_PER_TASK, bricks - k), rgb) for k in starts]
+        count = self.bricks_per_task
+        return [partial(self._bricks, x, y, z, k, min(count, bricks - k), rgb) for k in range(0, bricks, count)]
 
     def _points(self, points: DoubleArray, rgb: FloatArray) -> None:
         found = self.library.solidgrain_points(self.handle, points.ctypes.data, len(points), rgb.ctypes.data)
@@ -173,6 +177,7 @@ def _library(path: Path) -> ctypes.CDLL:
     """The loaded library. Raises KernelMissingError if the file is missing, cut short, foreign or of another version."""
     try:
         _check_whole(path)
+        _check_recorded(path)
         library = ctypes.CDLL(os.fspath(path))
         abi = library.solidgrain_abi()
         if abi != ABI:
@@ -196,6 +201,21 @@ def _declare(library: ctypes.CDLL) -> None:
     ):
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
+
+
+def _check_recorded(path: Path) -> None:
+    """Raises ValueError if a library is not the bytes that were installed: calling into damaged code ends the process.
+
+    A wheel's RECORD has the sha256 of its files ("Recording installed projects", Python packaging specifications); a library
+    without one, such as an editable install's, is taken as it is.
+    """
+    for record in path.parents[2].glob("solidgrain-*.dist-info/RECORD") if len(path.parents) > 2 else ():
+        with open(record, encoding="utf-8", newline="") as file:
+            for name, digest, _ in csv.reader(file):
+                if record.parents[1] / name == path and digest.startswith("sha256="):
+                    found = hashlib.sha256(path.read_bytes()).digest()
+                    if base64.urlsafe_b64encode(found).rstrip(b"=").decode() != digest.removeprefix("sha256="):
+                        raise ValueError(f"{path} is not the file that was installed (sha256 differs)")
 
 
 def _check_whole(path: Path) -> None:

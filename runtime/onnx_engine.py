@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
+from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
 CPU_CHUNK = 2048  # points: the chunk's activations, 1 MB a layer, stay in the second-level cache
 DEVICE_CHUNK = 131072  # points: enough to fill an accelerator
+DEVICE_TURN = threading.Lock()  # one chunk at a time is all that fits one, and DirectML's sessions are not for several threads
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
@@ -92,6 +95,7 @@ class PlacedGraph:
         import onnxruntime
 
         self.session, self.name = session, texture
+        self.turn = nullcontext() if session.get_providers()[0].startswith("CPU") else DEVICE_TURN
         place, device = onnxruntime.OrtValue.ortvalue_from_numpy, memory_device(session.get_providers()[0])
         self.inputs = {name: place(np.ascontiguousarray(value), device) for name, value in inputs.items()}
 
@@ -107,7 +111,8 @@ class PlacedGraph:
             binding.bind_cpu_input(name, array)
         binding.bind_output("rgb")
         try:
-            self.session.run_with_iobinding(binding)
+            with self.turn:
+                self.session.run_with_iobinding(binding)
             rgb: FloatArray = binding.copy_outputs_to_cpu()[0]
         except Exception as error:  # ONNX Runtime raises types of its own, without a common base
             raise EvaluationError(f"{self.name}: ONNX Runtime failed ({str(error).strip().splitlines()[0]})") from error

@@ -15,10 +15,6 @@ if TYPE_CHECKING:
 
 SUFFIX = "ExecutionProvider"
 ALIASES = {"directml": "dml"}
-OPTIONS: dict[str, dict[str, Any]] = {  # float32 means float32: TF32 and bfloat16 cost visible precision
-    "CUDAExecutionProvider": {"use_tf32": 0},
-    "OpenVINOExecutionProvider": {"device_type": "CPU", "precision": "FP32"},
-}
 DEVICES = {"CUDAExecutionProvider": "cuda", "TensorrtExecutionProvider": "cuda", "DmlExecutionProvider": "dml"}
 
 
@@ -27,6 +23,13 @@ def available_providers() -> list[str]:
     import onnxruntime
 
     return [name.removesuffix(SUFFIX).lower() for name in onnxruntime.get_available_providers() if name.endswith(SUFFIX)]
+
+
+def provider_options(full_name: str) -> dict[str, Any]:
+    """Float32 means float32, since TF32 and bfloat16 cost visible precision; and no more threads than the process may use."""
+    if full_name == "OpenVINOExecutionProvider":
+        return {"device_type": "CPU", "precision": "FP32", "num_of_threads": usable_threads()}
+    return {"use_tf32": 0} if full_name == "CUDAExecutionProvider" else {}
 
 
 def memory_device(full_name: str) -> str:
@@ -72,7 +75,7 @@ def open_session(path: Path, provider: str) -> onnxruntime.InferenceSession:
         options.enable_mem_pattern = False
     options.log_severity_level = 3  # errors; they arrive as exceptions as well
     try:
-        session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=[(full_name, OPTIONS.get(full_name, {}))])
+        session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=[(full_name, provider_options(full_name))])
     except Exception as error:  # ONNX Runtime raises types of its own, without a common base
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise BundleError(f"{path}: ONNX Runtime cannot load the graph ({reason}); export the bundle again") from error

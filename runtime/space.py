@@ -63,13 +63,14 @@ class Space:
         """Pixels along each side of the patch that the encoder sees."""
         return int(self.bundle.manifest["encoded_patch"])
 
-    def encode(self, exemplar: npt.ArrayLike, name: str = "encoded") -> Texture:
+    def encode(self, exemplar: npt.ArrayLike, name: str = "encoded", scale: float = 1.0) -> Texture:
         """The texture of a photograph [H, W, 3], float in [0, 1] or uint8, sRGB-encoded. Raises ExemplarError.
 
         The encoder sees the `patch`² pixels at its middle: a picture that shows more at a smaller scale must be scaled down
-        first, and the texture's pixels are then the smaller picture's.
+        first, and the texture's pixels are then the smaller picture's. `scale` is by how much it was: the texture remembers
+        it, for whoever compares it with the photograph.
         """
-        return self.texture(self.code(exemplar), name)
+        return self.open(replace(self._mapped(self.code(exemplar), name), scale=float(scale)))
 
     def code(self, exemplar: npt.ArrayLike) -> FloatArray:
         """z [latent] of a photograph, as in `encode`."""
@@ -124,7 +125,10 @@ class Space:
 
     def own(self, texture: Texture) -> TextureData:
         """What a texture of this space owns, which lies at one place of it. Raises BundleError for one that does not."""
-        data = texture.data
+        return self.owned(texture.data)
+
+    def owned(self, data: TextureData | BlendData) -> TextureData:
+        """The same of data that may be of any bundle."""
         if data.sampler_sha256 != self.bundle.sampler_sha256:
             raise BundleError(
                 f"texture {data.name!r} is of the bundle whose sampler.onnx has sha256 {data.sampler_sha256[:12]}…, "

@@ -95,9 +95,11 @@ def _resolve(source: str, bundle: str | None) -> tuple[TextureData | BlendData, 
 def check_fits(data: TextureData | BlendData, owner: Bundle) -> None:
     """Raises BundleError if a texture and a bundle do not belong together."""
     if data.sampler_sha256 != owner.sampler_sha256:
+        fitting = find_bundle(data.sampler_sha256, owner.folder)
+        advice = f"that is {fitting.name}, embedded" if fitting else "use the bundle that the texture was made with"
         raise BundleError(
             f"{owner.folder}: its sampler.onnx has sha256 {owner.sampler_sha256[:12]}…, "
-            f"texture {data.name!r} needs {data.sampler_sha256[:12]}…; use the bundle that the texture was made with"
+            f"texture {data.name!r} needs {data.sampler_sha256[:12]}…; {advice}"
         )
     octaves, width, layers = (owner.manifest[key] for key in ("octaves", "width", "hidden_layers"))
     expected = {"transforms": (octaves, 3, 3), "gamma": (layers, width), "delta": (layers, width)}

@@ -2,14 +2,15 @@
 
 A NumPy archive: `transforms` [n, 3, 3] float64 in texels per exemplar pixel, `gamma` and
 `delta` [hidden layers, width], `noise_weights` [4, n/4, width] float32, for textures of a space `latent` [latent] float32, and
-`header`, a JSON object with the format version, a name, and the sha256 of the sampler that the numbers belong to. Equal
-textures give equal bytes.
+`header`, a JSON object with the format version, a name, the sha256 of the sampler that the numbers belong to, and, where it is
+not 1, the scale at which a photograph was encoded. Equal textures give equal bytes.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ class TextureData:
     delta: npt.NDArray[np.float32]  # [hidden layers, m]
     noise_weights: npt.NDArray[np.float32]  # [4, n/4, m]
     latent: npt.NDArray[np.float32] | None = None  # z, where in its space it lies; no part of its colours
+    scale: float = 1.0  # pixels of the encoded photograph for each of its own; no part of its colours either
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """What its colours depend on."""
@@ -61,6 +63,7 @@ def write_texture(path: Path, texture: TextureData) -> None:
         "format_version": FORMAT_VERSION,
         "name": texture.name,
         "sampler_sha256": texture.sampler_sha256,
+        **({} if texture.scale == 1 else {"scale": texture.scale}),
     }
     latent = {} if texture.latent is None else {"latent": texture.latent}
     write_archive(path, header, {**texture.arrays(), **latent})
@@ -69,7 +72,10 @@ def write_texture(path: Path, texture: TextureData) -> None:
 def read_texture(path: Path) -> TextureData:
     """Read a texture file. Raises BundleError if it is damaged, of another version, or holds values that are not finite."""
     header, arrays = read_archive(path, FORMAT, FORMAT_VERSION, ARRAYS, OPTIONAL)
-    return TextureData(str(header.get("name", "")), str(header.get("sampler_sha256", "")), **arrays)
+    scale = header.get("scale", 1.0)
+    if not (isinstance(scale, int | float) and 0 < scale < math.inf):
+        raise BundleError(f"{path}: scale {scale!r} is no positive number; the file is damaged, save it again")
+    return TextureData(str(header.get("name", "")), str(header.get("sampler_sha256", "")), **arrays, scale=float(scale))
 
 
 def write_archive(path: Path, header: dict[str, Any], arrays: dict[str, npt.NDArray[Any]]) -> None:

@@ -53,7 +53,7 @@ class Recipe:
     crops: int = 128  # of the photograph, whose mean Gram matrices are aimed at
     measured: int = 8  # batches, of L_style as it is reported
     memory: int = 30  # iterations, of the running mean of L_style
-    patience: int = 100  # iterations without a new low of that mean: a plateau
+    patience: int = 60  # iterations without a new low of that mean: a plateau
     gain: float = 0.01  # by which a low must undercut the last one
     limit: float = 10.0  # times its first value that the mean may reach
 
@@ -258,6 +258,8 @@ class Descent:
         self.mean += (style - self.mean) / min(self.seen, self.recipe.memory)
         if self.seen == self.recipe.memory:
             self.first = self.mean
+        if self.seen < self.recipe.memory:
+            return  # the mean of a few is a matter of luck, and a lucky low would stand for long
         if self.mean < (1 - self.recipe.gain) * self.lowest:
             self.lowest, self.best, self.waited = self.mean, average.copy(), 0
 

@@ -126,7 +126,7 @@ def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData
     cut = Cut(arguments.patch_scale, arguments.crop)
     patch, note = cut_patch(photograph.pixels, space.patch, cut, str(arguments.photo))
     print(note, file=sys.stderr)
-    start = space.own(space.encode(patch, arguments.photo.stem))
+    start = space.own(space.encode(patch, arguments.photo.stem, cut.scale or 1.0))
     return start, patch if cut.corner else scaled(photograph.pixels, cut.scale or 1.0)
 
 
@@ -140,6 +140,8 @@ def say(found: Adapted, space: Space, arguments: argparse.Namespace) -> None:
         "space": space.name,
         "sampler_sha256": found.texture.sampler_sha256,
         "texture_sha256": found.texture.sha256,
+        "patch_scale": found.texture.scale,
+        "crop": arguments.crop,
         "features": arguments.features,
         "style_start": found.start,
         "style_end": found.end,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from solidgrain.train.processes import Processes
     from solidgrain.train.run import Run, RunFolder
     from solidgrain.train.settings import Budget, Settings
+    from solidgrain.train.space_run import SpaceRun
 
 FAILED, INTERRUPTED = 1, 130
 SMALLEST_PATCH = 32  # pixels
@@ -199,7 +201,47 @@ def start_space(arguments: argparse.Namespace) -> RunFolder:
     members = read_members(arguments.space, smallest, bool(arguments.skip_unreadable), warn)
     source = Source("", arguments.license or "", arguments.credit or "")
     budget = make_budget(arguments, settings)
-    return create_space_run(arguments.out, settings, members, held_out_names(arguments.hold_out), source, budget)
+    run = create_space_run(arguments.out, settings, members, held_out_names(arguments.hold_out), source, budget)
+    for line in (about_uneven(run), about_seen(run, arguments.warm_start)):
+        if line:
+            warn(line)
+    return run
+
+
+def about_uneven(run: SpaceRun) -> str:
+    """Which photographs one texture cannot describe, or ""."""
+    from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
+
+    uneven = [member.name for member in run.trained_on if nonstationarity(member.exemplar) > NONSTATIONARY]
+    count = f"{len(uneven)} of {len(run.trained_on)} photographs"
+    what = f"change across themselves (nonstationarity above {NONSTATIONARY})"
+    return f"{count} {what}: {some(uneven)}; crop even parts of them for better results" if uneven else ""
+
+
+def about_seen(run: SpaceRun, warm_start: Path | None) -> str:
+    """Which held-out photographs the weights that this run begins with were trained on, as far as is known, or ""."""
+    from solidgrain.runtime.bundle import embedded_folder, open_bundle
+    from solidgrain.train.run import is_space, pixels_sha256
+    from solidgrain.train.space_run import open_space_run
+
+    if warm_start:
+        known = open_space_run(warm_start).trained_on if warm_start.is_dir() and is_space(warm_start) else []
+        seen = {pixels_sha256(member.pixels) for member in known}
+    elif run.settings.critic_start:
+        manifest = open_bundle(embedded_folder(run.settings.critic_start)).manifest
+        seen = {entry["sha256"] for entry in manifest["training"].get("exemplars", [])}
+    else:
+        seen = set()
+    names = sorted(
+        member.name for member in run.members if member.name in run.held_out and pixels_sha256(member.pixels) in seen
+    )
+    teacher = warm_start or f"the critic of {run.settings.critic_start}"
+    return f"{len(names)} held-out photographs were trained on by {teacher}: {some(names)}; hold out others" if names else ""
+
+
+def some(names: Sequence[str], most: int = 5) -> str:
+    """The first of many names."""
+    return ", ".join(names[:most]) + ", ..." * (len(names) > most)
 
 
 def held_out_names(text: str | None) -> int | list[str]:
@@ -249,6 +291,8 @@ def make_settings(arguments: argparse.Namespace) -> Settings:
 
     changes = {name: getattr(arguments, name) for name in ("patch", "batch", "seed", "precision")}
     changes = {name: value for name, value in changes.items() if value is not None}
+    if arguments.warm_start:
+        changes["warm_start"] = arguments.warm_start.resolve().name
     if changes.get("patch", SMALLEST_PATCH) < SMALLEST_PATCH:
         raise UsageError(f"--patch {arguments.patch}: expected at least {SMALLEST_PATCH}")
     kind = " space" if arguments.space else ""
@@ -298,7 +342,10 @@ def make_budget(arguments: argparse.Namespace, settings: Settings) -> Budget:
 
 
 def choose_device(name: str) -> torch.device:
-    """Raises TrainingError for CUDA where there is none: no silent fall-back."""
+    """Raises TrainingError for CUDA where there is none: no silent fall-back.
+
+    Float32 is then float32 on GPUs, too: in TF32, which torch convolves in, gradient penalties keep ten bits of it.
+    """
     import torch
 
     available = torch.cuda.is_available()
@@ -306,4 +353,5 @@ def choose_device(name: str) -> torch.device:
         raise TrainingError(
             f"--device cuda: torch {torch.__version__} sees no CUDA device; use --device cpu or install a CUDA build"
         )
+    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     return torch.device("cuda" if name == "cuda" or (name == "auto" and available) else "cpu")

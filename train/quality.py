@@ -34,6 +34,7 @@ Measures = dict[str, float]
 
 FRECHET_LAYERS, GRAM_LAYERS = (1, 3), STYLE_LAYERS
 LARGEST_CROP = 256  # pixels
+COMPARED = 6  # crops of an exemplar at most, all over it
 SMALLEST = 64  # pixels along each side of an exemplar: its crops must outlast the pyramids
 SMALLEST_FLOOR = 1e-6  # between colours: a photograph's is a thousand times that
 
@@ -62,17 +63,16 @@ def evaluate(
     measure = Measure(inception)
     image = as_image(exemplar)
     size = min(image.shape[2] // 2, image.shape[3] // 2, LARGEST_CROP)
-    squares = disjoint_crops(image, size)
+    squares = spread_out(disjoint_crops(image, size), COMPARED)
     crops = [measure.statistics(square) for square in squares]
-    pairs = [(a, b) for i, a in enumerate(crops) for b in crops[:i]]
-    floor = _mean(measure.distances(a, b) for a, b in pairs[:15])
+    floor = _mean(measure.distances(a, b) for i, a in enumerate(crops) for b in crops[:i])
     if floor["color"] < SMALLEST_FLOOR:
         raise ExemplarError(
             f"the exemplar has the same colours in each of its squares of {size}² pixels, so that nothing tells how far apart "
             "its own parts are; expected a photograph that neither repeats itself nor is of one colour, or one period of it"
         )
-    quarter = [measure.statistics(square.rot90(1, (2, 3))) for square in squares[:4]]
-    turned = _mean(measure.distances(a, b) for i, a in enumerate(crops[:4]) for j, b in enumerate(quarter) if i != j)
+    quarter = [measure.statistics(square.rot90(1, (2, 3))) for square in squares]
+    turned = _mean(measure.distances(a, b) for i, a in enumerate(crops) for j, b in enumerate(quarter) if i != j)
 
     def ratios(rotation_of: Callable[[int, torch.Generator], Tensor]) -> dict[str, tuple[float, float]]:
         measured = []
@@ -80,7 +80,7 @@ def evaluate(
             generator = torch.Generator().manual_seed(seed)
             rotation = rotation_of(seed, generator)
             picture = measure.statistics(as_image(cut(sample, size, rotation, seed, random_place(generator))))
-            measured.append(_mean(measure.distances(crop, picture) for crop in crops[:4]))
+            measured.append(_mean(measure.distances(crop, picture) for crop in crops))
         return {name: _spread([one[name] / floor[name] for one in measured]) for name in floor}
 
     return Evaluation(
@@ -97,6 +97,11 @@ def disjoint_crops(image: Tensor, size: int) -> list[Tensor]:
     """The image [1, 3, H, W] cut into squares, from the top left."""
     rows, columns = (range(0, extent - size + 1, size) for extent in image.shape[2:])
     return [image[..., top : top + size, left : left + size] for top in rows for left in columns]
+
+
+def spread_out(squares: list[Tensor], count: int) -> list[Tensor]:
+    """At most so many of a picture's squares, evenly along their order: from its top to its bottom, not below each other."""
+    return [squares[round(k)] for k in np.linspace(0, len(squares) - 1, min(count, len(squares)))]
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,7 @@ class Settings:
     # Optimisation
     critic_contrast: float = 0.0  # root mean square to which D sees faint exemplars stretched; 0: as they are
     critic_start: str = ""  # the embedded space whose critic D starts as, else N(0,1)
+    warm_start: str = ""  # the run or checkpoint file whose weights were taken over instead, for the record
     critic_rate: float = 1e-3
     critic_rate_floor: float = 1e-3
     critic_half_life: float = 0.0

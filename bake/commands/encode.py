@@ -36,6 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
         "space": space.name,
         "sampler_sha256": texture.data.sampler_sha256,
         "texture_sha256": texture.data.sha256,
+        "patch_scale": arguments.patch_scale or 1.0,
+        "crop": arguments.crop,  # null: the middle
         "latent": [] if latent is None else latent.tolist(),
     }
     if arguments.json:

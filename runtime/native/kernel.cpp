@@ -70,13 +70,18 @@ void* allocate(size_t bytes) {
   return block;
 }
 
-// The table [64, 64, 64] as [64, 64, 65] floats, or bfloat16 pairs.
+size_t table_bytes(bool bfloat16) { return aligned((bfloat16 ? 2 : 4) * TABLE); }
+
+// The table [64, 64, 64] as [64, 64, 65] floats or bfloat16.
 void fill_table(const float* noise, bool bfloat16, void* table) {
   for (int row = 0; row < RESOLUTION * RESOLUTION; row++, noise += RESOLUTION)
     for (int z = 0; z < ROW; z++) {
-      float texel = noise[z % RESOLUTION], next = noise[(z + 1) % RESOLUTION];
-      uint32_t pair = round_to_bfloat16(texel) | round_to_bfloat16(next) << 16;
-      memcpy(static_cast<uint32_t*>(table) + row * ROW + z, bfloat16 ? static_cast<void*>(&pair) : &texel, 4);
+      const float texel = noise[z % RESOLUTION];
+      const int at = row * ROW + z;
+      if (bfloat16)
+        static_cast<uint16_t*>(table)[at] = uint16_t(round_to_bfloat16(texel));
+      else
+        static_cast<float*>(table)[at] = texel;
     }
 }
 
@@ -110,11 +115,12 @@ struct Workspace {
   ~Workspace() { free(memory); }
   Workspace(const Workspace&) = delete;
 
-  // Colours of the first `count` places, clipped to [0, 1]. Returns the first that is not finite, or -1.
-  int64_t evaluate(const Sampler& sampler, int count) {
+  // Colours of the first `count` places, clipped to [0, 1]; with `rows`, each 16 share y and z. Returns the first that is not
+  // finite, or -1.
+  int64_t evaluate(const Sampler& sampler, int count, bool rows) {
     const int padded = (count + PADDING - 1) / PADDING * PADDING;
     for (int i = count; i < padded; i++) x[i] = x[count - 1], y[i] = y[count - 1], z[i] = z[count - 1];
-    sampler.path->look_up(sampler, x, y, z, padded, eta);
+    sampler.path->look_up(sampler, x, y, z, padded, rows, eta);
     sampler.path->perceive(sampler, eta, count, rgb, scratch);
     int64_t wrong = -1;
     for (int i = 3 * count - 1; i >= 0; i--) {
@@ -175,7 +181,8 @@ Sampler* solidgrain_open(const SamplerDescription* given, const char* path_name)
     weights = describe(sampler, l, weights, layer);
     bytes += aligned(path->packed_bytes(sampler, layer));
   }
-  char* memory = static_cast<char*>(allocate(bytes + aligned(4 * TABLE) * sampler.octaves));
+  const size_t table = table_bytes(sampler.bfloat16);
+  char* memory = static_cast<char*>(allocate(bytes + table * sampler.octaves));
   if (!memory) return nullptr;
 
   sampler.octave = reinterpret_cast<Octave*>(memory + aligned(sizeof(Sampler)));
@@ -190,7 +197,7 @@ Sampler* solidgrain_open(const SamplerDescription* given, const char* path_name)
     layer.bias = layer.weights = nullptr;  // the caller's, gone after this
     packed += aligned(path->packed_bytes(sampler, layer));
   }
-  for (int i = 0; i < sampler.octaves; i++, packed += aligned(4 * TABLE)) {
+  for (int i = 0; i < sampler.octaves; i++, packed += table) {
     Octave& octave = sampler.octave[i];
     memcpy(octave.transform, given->transforms + 9 * i, sizeof octave.transform);
     memcpy(octave.offset, given->offsets + 3 * i, sizeof octave.offset);
@@ -212,7 +219,7 @@ int64_t solidgrain_points(const Sampler* sampler, const double* points, int64_t 
       const double* point = points + 3 * (first + i);
       space.x[i] = point[0], space.y[i] = point[1], space.z[i] = point[2];
     }
-    const int64_t wrong = space.evaluate(*sampler, now);
+    const int64_t wrong = space.evaluate(*sampler, now, false);
     if (wrong >= 0) return first + wrong;
     memcpy(rgb + 3 * first, space.rgb, sizeof(float) * 3 * now);
   }
@@ -236,7 +243,7 @@ int64_t solidgrain_grid(const Sampler* sampler, const double* x, int64_t columns
     for (int64_t c = 0; c < depth; c++)
       for (int64_t b = 0; b < height; b++)
         for (int64_t a = 0; a < width; a++, i++) space.x[i] = x[left + a], space.y[i] = y[top + b], space.z[i] = z[front + c];
-    const int64_t wrong = space.evaluate(*sampler, i);
+    const int64_t wrong = space.evaluate(*sampler, i, width % 16 == 0);
     auto place = [&](int64_t row) { return ((front + row / height) * rows + top + row % height) * columns + left; };
     if (wrong >= 0) return place(wrong / width) + wrong % width;
     for (int64_t row = 0; row < depth * height; row++)

@@ -10,11 +10,18 @@
 
 namespace {
 
-template <class S> inline typename S::D locate(const Octave& octave, int axis, const typename S::D (&point)[3]) {
-  const double* row = octave.transform + 3 * axis;
-  auto sum = S::fma(S::all(row[2]), point[2], S::all(octave.offset[axis]));
-  sum = S::fma(S::all(row[1]), point[1], sum);
-  return S::fma(S::all(row[0]), point[0], sum);
+// Coordinate `axis` of a vector of points in an octave. In a `row`, they share y and z, and what comes of these is a number.
+template <class S, bool row>
+inline typename S::D locate(const Octave& octave, int axis, const double* x, const double* y, const double* z) {
+  const double* weights = octave.transform + 3 * axis;
+  typename S::D sum;
+  if constexpr (row) {
+    sum = S::all(S::fma(weights[1], *y, S::fma(weights[2], *z, octave.offset[axis])));
+  } else {
+    sum = S::fma(S::all(weights[2]), S::load(z), S::all(octave.offset[axis]));
+    sum = S::fma(S::all(weights[1]), S::load(y), sum);
+  }
+  return S::fma(S::all(weights[0]), S::load(x), sum);
 }
 
 // The eight corners of a cell are four edges along z, x slowest; `low` and `high` are where an edge's two ends are stored.
@@ -158,7 +165,7 @@ template <class S> inline typename S::F trilinear(const typename S::F (&low)[4],
   return mix<S>(mix<S>(edge[0], edge[1], fraction[1]), mix<S>(edge[2], edge[3], fraction[1]), fraction[0]);
 }
 
-// Reads from a table of floats, or of bfloat16 pairs (texel, next along z).
+// Reads from a table of floats, or of bfloat16: there a texel and the next along z are one read of 32 bits.
 template <class S> struct FloatTable {
   static constexpr bool coarse = false;
   static void read(const void* table, const typename S::I& at, typename S::F& low, typename S::F& high) {
@@ -172,21 +179,21 @@ template <class S> struct FloatTable {
 template <class S> struct PairTable {
   static constexpr bool coarse = true;
   static void read(const void* table, const typename S::I& at, typename S::F& low, typename S::F& high) {
-    auto pair = S::gather(static_cast<const uint32_t*>(table), at);
+    auto pair = S::gather(static_cast<const uint16_t*>(table), at);
     low = S::as_float(S::template shift_left<16>(pair));
     high = S::as_float(S::bit_and(pair, S::all(int32_t(0xffff0000))));
   }
   static typename S::F read(const void* table, const typename S::I& at) {
-    return S::as_float(S::template shift_left<16>(S::gather(static_cast<const uint32_t*>(table), at)));
+    return S::as_float(S::template shift_left<16>(S::gather(static_cast<const uint16_t*>(table), at)));
   }
 };
 
-template <class S, class Table, bool tiled>
+template <class S, class Table, bool tiled, bool rows>
 void look_up_octave(const Octave& octave, bool far, const double* x, const double* y, const double* z, int count, float* eta) {
   const bool small = tiled && is_small(octave);
   for (int first = 0; first < count; first += S::LANES) {
-    const typename S::D point[3] = {S::load(x + first), S::load(y + first), S::load(z + first)};
-    const typename S::D at[3] = {locate<S>(octave, 0, point), locate<S>(octave, 1, point), locate<S>(octave, 2, point)};
+    typename S::D at[3];
+    for (int axis = 0; axis < 3; axis++) at[axis] = locate<S, rows>(octave, axis, x + first, y + first, z + first);
     typename S::F low[4], high[4], fraction[3];
     typename S::I low_at[4], high_at[4];
     if (tiled) {
@@ -213,19 +220,24 @@ inline bool is_far(const Octave& octave, const double (&farthest)[3]) {
   return 4 * cells * (entries + 1) >= 0x1p50;
 }
 
+template <class S, class Table> auto octave_lookup(bool tiled, bool rows) {
+  if (tiled) return rows ? look_up_octave<S, Table, true, true> : look_up_octave<S, Table, true, false>;
+  return rows ? look_up_octave<S, Table, false, true> : look_up_octave<S, Table, false, false>;
+}
+
 // With `pairs`, the sampler's precision may be bfloat16.
-template <class S, bool pairs> void look_up(const Sampler& sampler, const double* x, const double* y, const double* z, int count, float* eta) {
+template <class S, bool pairs>
+void look_up(const Sampler& sampler, const double* x, const double* y, const double* z, int count, bool rows, float* eta) {
   double farthest[3] = {0, 0, 0};
   const double* along[3] = {x, y, z};
   for (int axis = 0; axis < 3 && sampler.tiled; axis++)
     for (int i = 0; i < count; i++) farthest[axis] = std::fabs(along[axis][i]) > farthest[axis] ? std::fabs(along[axis][i]) : farthest[axis];
+  auto run = octave_lookup<S, FloatTable<S>>(sampler.tiled, rows);
+  if constexpr (pairs)
+    if (sampler.bfloat16) run = octave_lookup<S, PairTable<S>>(sampler.tiled, rows);
   for (int i = 0; i < sampler.octaves; i++, eta += STRIDE) {
     const Octave& octave = sampler.octave[i];
-    bool far = sampler.tiled && is_far(octave, farthest);
-    auto run = sampler.tiled ? look_up_octave<S, FloatTable<S>, true> : look_up_octave<S, FloatTable<S>, false>;
-    if constexpr (pairs)
-      if (sampler.bfloat16) run = sampler.tiled ? look_up_octave<S, PairTable<S>, true> : look_up_octave<S, PairTable<S>, false>;
-    run(octave, far, x, y, z, count, eta);
+    run(octave, sampler.tiled && is_far(octave, farthest), x, y, z, count, eta);
   }
 }
 

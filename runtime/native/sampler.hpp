@@ -27,7 +27,7 @@ struct Octave {
   double transform[9];
   double offset[3];
   double lattice[9];   // row-major, lower-triangular
-  const void* table;   // [64, 64, 65] float, or bfloat16 pairs (texel, next along z) of 32 bits [64, 64, 65]
+  const void* table;   // [64, 64, 65] float or bfloat16
 };
 
 // One layer of the perceptron, style folded in.
@@ -57,8 +57,8 @@ struct Path {
   size_t (*packed_bytes)(const Sampler&, const Layer&);
   void (*pack)(const Sampler&, const Layer&, void* packed);
   size_t (*scratch_bytes)(const Sampler&);
-  // Noise of `count` points (a multiple of 16): eta [octaves, STRIDE].
-  void (*look_up)(const Sampler&, const double* x, const double* y, const double* z, int count, float* eta);
+  // Noise of `count` points (a multiple of 16): eta [octaves, STRIDE]. With `rows`, each 16 of them share y and z.
+  void (*look_up)(const Sampler&, const double* x, const double* y, const double* z, int count, bool rows, float* eta);
   // Colour of `count` points: rgb [count, 3], not clipped.
   void (*perceive)(const Sampler&, const float* eta, int count, float* rgb, void* scratch);
 };

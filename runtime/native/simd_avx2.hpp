@@ -25,6 +25,7 @@ struct Avx2 {
 
   static F fma(F a, F b, F c) { return _mm256_fmadd_ps(a, b, c); }
   static D fma(D a, D b, D c) { return {_mm256_fmadd_pd(a.low, b.low, c.low), _mm256_fmadd_pd(a.high, b.high, c.high)}; }
+  static double fma(double a, double b, double c) { return _mm_cvtsd_f64(_mm_fmadd_sd(_mm_set_sd(a), _mm_set_sd(b), _mm_set_sd(c))); }
   static F sub(F a, F b) { return _mm256_sub_ps(a, b); }
   static F leaky(F v, F slope) { return _mm256_max_ps(v, _mm256_mul_ps(v, slope)); }
   static D add(D a, D b) { return {_mm256_add_pd(a.low, b.low), _mm256_add_pd(a.high, b.high)}; }

@@ -25,6 +25,7 @@ struct Avx512 {
 
   static F fma(F a, F b, F c) { return _mm512_fmadd_ps(a, b, c); }
   static D fma(D a, D b, D c) { return {_mm512_fmadd_pd(a.low, b.low, c.low), _mm512_fmadd_pd(a.high, b.high, c.high)}; }
+  static double fma(double a, double b, double c) { return _mm_cvtsd_f64(_mm_fmadd_sd(_mm_set_sd(a), _mm_set_sd(b), _mm_set_sd(c))); }
   static F sub(F a, F b) { return _mm512_sub_ps(a, b); }
   static F floor(F v) { return _mm512_roundscale_ps(v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
   static F leaky(F v, F slope) { return _mm512_max_ps(v, _mm512_mul_ps(v, slope)); }
@@ -64,7 +65,8 @@ struct Avx512 {
   static F as_float(I v) { return _mm512_castsi512_ps(v); }
 
   static F gather(const float* table, I index) { return _mm512_i32gather_ps(index, table, 4); }
-  static I gather(const uint32_t* table, I index) { return _mm512_i32gather_epi32(index, table, 4); }
+  // 32 bits: table[index] below, table[index + 1] above.
+  static I gather(const uint16_t* table, I index) { return _mm512_i32gather_epi32(index, table, 2); }
   // Two neighbours in one read of 64 bits each: low = table[index], high = table[index + 1].
   static void gather_pair(const float* table, I index, F& low, F& high) {
     const I evens = _mm512_set_epi32(30, 28, 26, 24, 22, 20, 18, 16, 14, 12, 10, 8, 6, 4, 2, 0);

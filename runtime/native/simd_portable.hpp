@@ -26,6 +26,7 @@ struct Portable {
 
   static F fma(F a, F b, F c) { return a * b + c; }
   static D fma(D a, D b, D c) { return a * b + c; }
+  static double fma(double a, double b, double c) { return a * b + c; }
   static F sub(F a, F b) { return a - b; }
   static F leaky(F v, F slope) { return v > 0 ? v : v * slope; }
   static D add(D a, D b) { return a + b; }

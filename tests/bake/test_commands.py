@@ -159,6 +159,14 @@ def test_doctor_reports_a_damaged_texture_and_all_the_rest(solidgrain, tmp_path,
     assert "OpenGL" in outcome.out
 
 
+def test_doctor_says_why_there_is_no_kernel(solidgrain, monkeypatch):
+    monkeypatch.setenv("SOLIDGRAIN_KERNEL_LIBRARY", "nowhere.so")
+    outcome = solidgrain("doctor")
+    assert outcome.code == 0, outcome.err
+    assert "the fused kernel cannot be loaded" in outcome.out
+    assert "nowhere.so" in outcome.out
+
+
 def test_doctor_finds_two_builds_of_onnx_runtime(solidgrain, tmp_path, monkeypatch):
     package = tmp_path / "onnxruntime_gpu-1.0.dist-info"
     package.mkdir()

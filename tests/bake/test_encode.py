@@ -49,6 +49,22 @@ def test_encode_writes_the_texture_that_the_runtime_makes_of_the_middle(
     np.testing.assert_array_equal(load_texture(out, bundle=toy_space_folder).data.latent, expected.latent)
 
 
+def test_the_cut_is_reported_and_the_scale_kept(solidgrain, toy_space_folder, photograph, tmp_path):
+    out = tmp_path / "cliff.sgt.npz"
+    flags = ("--patch-scale", 1.5, "--crop", "7,5", "--out", out, "--json")
+    outcome = solidgrain("encode", photograph, "--bundle", toy_space_folder, *flags)
+    report = json.loads(outcome.out)
+    assert (report["patch_scale"], report["crop"], read_texture(out).scale) == (1.5, [7, 5], 1.5)
+
+
+def test_an_advised_scale_fits(toy_space_folder, tmp_path):
+    """1020 pixels are 7.96 times 128, and not 8 times."""
+    picture = np.zeros((1020, 1020, 3), np.float32)
+    with pytest.raises(ExemplarError, match=r"--patch-scale 7\.96$"):
+        cut_patch(picture, 128, Cut(9.0), "wide.png")
+    assert cut_patch(picture, 128, Cut(7.96), "wide.png")[0].shape == (128, 128, 3)
+
+
 def test_a_photograph_bakes_as_the_texture_that_is_saved_beside_it(solidgrain, toy_space_folder, photograph, tmp_path):
     flags = ("--bundle", toy_space_folder, "--size", "8", "--out", tmp_path / "cliff.npy", "--quiet")
     assert solidgrain("bake", photograph, *flags).code == 0

@@ -37,6 +37,7 @@ from solidgrain.train.space import Space
 from solidgrain.train.task import make_task
 from solidgrain.train.vgg import find_weights
 
+EXEMPLARS = Path(__file__).resolve().parents[3] / "shared" / "data" / "exemplars"  # photographs do not come with the project
 SITTING = 5.0  # minutes of training between checkpoints
 CHUNK = 1 << 16  # points at a time
 PLAN = "plan.json"

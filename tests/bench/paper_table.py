@@ -31,10 +31,9 @@ from solidgrain.train.slices import from_quaternions, upright
 from solidgrain.train.variants import vary
 from tests.bench import cells
 
-EXEMPLARS = Path(__file__).resolve().parents[3] / "shared" / "data" / "exemplars"
 DEFAULTS = {  # the embedded critic, which FAST starts from, has seen neither
-    "wood": EXEMPLARS / "large" / "materialx_wood.jpg",
-    "granite": EXEMPLARS / "stone128" / "Granite002A.png",
+    "wood": cells.EXEMPLARS / "large" / "materialx_wood.jpg",
+    "granite": cells.EXEMPLARS / "stone128" / "Granite002A.png",
 }
 LARGEST = 512  # pixels: larger photographs are reduced by a whole factor, so that patches see their structures
 SMALLEST = 128

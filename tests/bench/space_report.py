@@ -206,7 +206,7 @@ def order(by_column: Pairs, key: Any) -> str:
 
 
 def agreement(ours: Pairs, theirs: Pairs, key: Any) -> str:
-    """Whether the methods that both have come in the same order."""
+    """Whether the methods that both have come in the same order; of two, one of which is the truth, that would say nothing."""
     both = [column for column in theirs if column in ours]
     same = sorted(both, key=lambda c: key(ours[c])) == sorted(both, key=lambda c: key(theirs[c]))
-    return "" if len(both) < 2 else f" ({'' if same else 'not '}the paper's order)"
+    return "" if len(both) < 3 else f" ({'' if same else 'not '}the paper's order of these {len(both)})"

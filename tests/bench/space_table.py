@@ -40,9 +40,8 @@ from tests.bench.paper_table import slice_picture
 from tests.bench.space_measure import Reference, cut_crops, measure_slices
 from tests.bench.space_methods import ADAPTED, TITLES, Methods, Other, open_henzler
 
-EXEMPLARS = Path(__file__).resolve().parents[3] / "shared" / "data" / "exemplars"
-FAR = Path("wood128") / "Wood081.png"  # in EXEMPLARS
-LARGE = "large"  # in EXEMPLARS
+FAR = Path("wood128") / "Wood081.png"  # in cells.EXEMPLARS
+LARGE = "large"  # in cells.EXEMPLARS
 LARGE_SLICES = 10  # of each kind, at most: a mean is asked of them, and no test
 
 
@@ -103,7 +102,7 @@ def parser() -> argparse.ArgumentParser:
     add("--only-unadapted", action="store_true", help="leave the adapted columns for another time")
     add("--critic", type=Path, metavar="FILE", help="what adapting with D needs, where the bundle does not hold it")
     add("--henzler", type=Path, metavar="FOLDER", help="a space after Henzler et al., bundle or run, for a column of its own")
-    add("--exemplars", type=Path, default=EXEMPLARS, metavar="FOLDER", help=f"holds the photographs ({EXEMPLARS})")
+    add("--exemplars", type=Path, default=cells.EXEMPLARS, metavar="FOLDER", help=f"holds the photographs ({cells.EXEMPLARS})")
     add("--far", type=Path, metavar="PHOTO", help=f"no stone at all, encoded as it is (FOLDER/{FAR})")
     add("--large", action="store_true", help=f"every photograph of FOLDER/{LARGE} as well, {LARGE_SLICES} slices at most")
     add("--patch-scale", type=parse_scale, default=1.0, metavar="S", help="of --large: their pixels per texture pixel (1)")

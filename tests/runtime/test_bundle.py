@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,21 @@ def test_a_texture_of_another_bundle_is_refused_with_the_sha256_that_it_needs(tm
     toy.save(tmp_path / "mine.sgt.npz")
     with pytest.raises(BundleError, match=toy.data.sampler_sha256[:12]):
         load(tmp_path / "mine.sgt.npz", bundle=load("granite").bundle.folder)
+    load("marble").save(tmp_path / "marble.sgt.npz")
+    with pytest.raises(BundleError, match="that is marble, embedded"):
+        load(tmp_path / "marble.sgt.npz", bundle="granite")
+
+
+def test_a_texture_remembers_at_what_scale_its_photograph_was_encoded(tmp_path, toy):
+    write_texture(tmp_path / "a.sgt.npz", toy.data)
+    assert read_texture(tmp_path / "a.sgt.npz").scale == 1
+    reduced = replace(toy.data, scale=2.5)
+    write_texture(tmp_path / "b.sgt.npz", reduced)
+    assert read_texture(tmp_path / "b.sgt.npz").scale == 2.5
+    assert reduced.sha256 == toy.data.sha256
+    write_texture(tmp_path / "c.sgt.npz", replace(toy.data, scale=-1.0))
+    with pytest.raises(BundleError, match=r"scale -1\.0 is no positive number"):
+        read_texture(tmp_path / "c.sgt.npz")
 
 
 def test_the_bundle_of_a_texture_file_is_named_as_any_other(tmp_path, monkeypatch):

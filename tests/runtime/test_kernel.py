@@ -1,5 +1,7 @@
 """The fused kernel gives the colours of the formula, on every path that this machine has, and steps aside where it must."""
 
+import base64
+import hashlib
 import os
 import shutil
 import subprocess
@@ -158,6 +160,23 @@ def test_bfloat16_is_close_to_float32(loaded, tile):
 
 
 @pytest.mark.skipif("amx" not in PATHS, reason="this processor has no AMX")
+@pytest.mark.parametrize("tile", ["", "xz"])
+@pytest.mark.parametrize("width", [16, 48, 112, 160])
+def test_bfloat16_is_the_formula_in_points_and_in_grids_of_any_width(loaded, width, tile):
+    for octaves in (16, 32):
+        weights = toy_weights(octaves, width, seed=width)
+        texture = loaded("amx", weights, precision="bfloat16")
+        volume = texture.grid((2, 3, 37), 7, origin=(1e6, -3, 0.25), tile=tile)
+        z, y, x = np.indices(volume.shape[:3]).reshape(3, -1)
+        points = np.stack([1e6 + (x + 0.5), -3 + (y + 0.5), 0.25 + (z + 0.5)], axis=1)
+        if not tile:
+            assert np.array_equal(texture.sample(points, 7), volume.reshape(-1, 3))
+        tiling = texture.tiling(volume.shape[:3], tile=tile)
+        some = [[tiling.wrap(point[axis : axis + 1], axis)[0] for axis in range(3)] for point in points[::5]]
+        np.testing.assert_allclose(volume.reshape(-1, 3)[::5], expected_colors(weights, some, 7, tiling), atol=0.02)
+
+
+@pytest.mark.skipif("amx" not in PATHS, reason="this processor has no AMX")
 @pytest.mark.parametrize("name", embedded_names())
 def test_embedded_textures_in_bfloat16_are_above_45_decibels(name):
     exact, fast = load(name), load(name, precision="bfloat16")
@@ -300,6 +319,32 @@ def test_a_damaged_library_is_stepped_around(toy_folder, monkeypatch, tmp_path, 
     assert str(library) in texture.provider_note or "solidgrain_abi" in texture.provider_note
     with pytest.raises(ProviderError):
         load(toy_folder, provider="kernel")
+
+
+@needs_kernel
+def test_a_library_that_is_not_what_was_installed_is_not_called(toy_folder, monkeypatch, tmp_path):
+    """A page of zeros in the middle of it loads, and ends the process when it is called."""
+    whole = next(Path(kernel.__file__).parent.glob("_kernel*")).read_bytes()
+    library, record = tmp_path / "solidgrain/runtime/_kernel.so", tmp_path / "solidgrain-1.0.dist-info/RECORD"
+    library.parent.mkdir(parents=True), record.parent.mkdir()
+    digest = base64.urlsafe_b64encode(hashlib.sha256(whole).digest()).rstrip(b"=").decode()
+    record.write_text(f"solidgrain/runtime/_kernel.so,sha256={digest},{len(whole)}\nsolidgrain-1.0.dist-info/RECORD,,\n")
+    library.write_bytes(whole[:8192] + bytes(4096) + whole[12288:])
+    monkeypatch.setenv("SOLIDGRAIN_KERNEL_LIBRARY", str(library))
+    texture = load(toy_folder)
+    assert texture.provider == "CPUExecutionProvider"
+    assert "is not the file that was installed (sha256 differs)" in texture.provider_note
+    library.unlink()
+    library.write_bytes(whole)
+    assert load(toy_folder).provider.startswith("kernel:")
+
+
+@needs_kernel
+def test_wide_samplers_have_small_tasks(loaded):
+    """Ctrl-C waits for the tasks that have begun."""
+    texture = loaded(PATHS[-1], toy_weights(16, 256))
+    instance = texture._instance(texture.tiling((1, 1, 1)), 0)
+    assert len(instance.point_tasks(np.zeros((16384, 3)), np.empty((16384, 3), np.float32))) == 4
 
 
 @needs_kernel

@@ -1,10 +1,13 @@
 """Execution providers are chosen by name, refused by name, and never fallen back from, shown without their hardware."""
 
+import time
+
 import numpy as np
 import onnxruntime
 import pytest
 
-from solidgrain.runtime import ProviderError, load
+from solidgrain.runtime import ProviderError, load, onnx_engine
+from solidgrain.runtime.provider import usable_threads
 
 OFFERED = ["CUDAExecutionProvider", "DmlExecutionProvider", "CoreMLExecutionProvider", "OpenVINOExecutionProvider"]
 NAMES = {"cuda": OFFERED[0], "directml": OFFERED[1], "dml": OFFERED[1], "coreml": OFFERED[2], "OpenVINO": OFFERED[3]}
@@ -55,6 +58,25 @@ def test_float32_is_float32(machine, toy_folder):
     assert machine["options"] == {"use_tf32": 0}
     load(toy_folder, provider="openvino")
     assert machine["options"]["precision"] == "FP32"
+
+
+def test_a_device_runs_one_chunk_at_a_time_and_no_more_threads_than_it_may(machine, toy_folder, monkeypatch):
+    running, most = [], []
+
+    def run(self, binding):
+        running.append(1)
+        most.append(len(running))
+        time.sleep(0.01)
+        self.session.run_with_iobinding(binding)
+        running.pop()
+
+    monkeypatch.setattr(machine["session"], "run_with_iobinding", run, raising=False)
+    monkeypatch.setattr(onnx_engine, "DEVICE_CHUNK", 64)
+    load(toy_folder, provider="directml", threads=4).grid((2, 16, 16))
+    assert len(most) == 8
+    assert max(most) == 1
+    load(toy_folder, provider="openvino")
+    assert machine["options"]["num_of_threads"] == usable_threads()
 
 
 def test_inputs_are_placed_on_the_device_once_and_chunks_are_large(machine, toy_folder):

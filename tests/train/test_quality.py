@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip(
     "stlpips_pytorch", reason="the VGG-16 weights come with stlpips-pytorch: pip install 'solidgrain[evaluate]'"
 )
 
 from solidgrain.runtime import ExemplarError, load_space
-from solidgrain.train.quality import evaluate
+from solidgrain.train.quality import disjoint_crops, evaluate, spread_out
 from tests.bench import cells
 from tests.train.conftest import blotches
 
@@ -112,6 +113,14 @@ def test_the_command_refuses_what_it_cannot_measure(solidgrain, toy_folder, tmp_
     outcome = solidgrain("evaluate", toy_folder, "--exemplar", tmp_path / "small.png", *flags)
     assert outcome.code == code
     assert message in outcome.err
+
+
+def test_crops_of_a_large_exemplar_are_all_over_it():
+    image = torch.arange(16.0).reshape(4, 4).kron(torch.ones(8, 8))[None, None]
+    squares = spread_out(disjoint_crops(image, 8), 6)
+    rows, columns = zip(*(divmod(int(square.mean()), 4) for square in squares), strict=True)
+    assert set(rows) == set(columns) == {0, 1, 2, 3}
+    assert len(spread_out(disjoint_crops(image[..., :16, :16], 8), 6)) == 4
 
 
 def test_inception_weights_that_are_missing_are_noticed_before_measuring(solidgrain, toy_folder, tmp_path):

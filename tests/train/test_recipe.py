@@ -26,7 +26,8 @@ def small(monkeypatch, tmp_path):
     monkeypatch.setattr(preview, "SIZE", 32)
     tiny = preset("fast", **TINY)
     quality = dict.fromkeys(("vgg_frechet", "gram"), (1.0, 0.0))
-    monkeypatch.setattr(recipe, "evaluate", lambda *_: Evaluation(64, 1, {}, quality, quality))
+    floor, turned = {"vgg_frechet": 0.1, "gram": 0.1}, {"vgg_frechet": 1.5, "gram": 1.2}
+    monkeypatch.setattr(recipe, "evaluate", lambda *_: Evaluation(64, 1, floor, quality, quality, turned))
     monkeypatch.setattr(recipe, "ROWS", {"fast": ("the preset", tiny), "colors": ("plain", tiny)})
     cells.write_png(tmp_path / "blotches.png", np.kron(blotches(128, 150), np.ones((1, 2, 1), np.float32)))
     where = ["--out", str(tmp_path / "out"), "--exemplar", str(tmp_path / "blotches.png")]
@@ -51,15 +52,32 @@ def test_the_table_has_every_row_at_every_mark_and_a_second_start_changes_nothin
     printed = capsys.readouterr().out
     lines = [line.split("|") for line in printed.splitlines() if line.startswith("|") and not line.startswith("|---")]
     assert [line[1].strip() for line in lines if line[1].strip()] == [
-        *("the preset", "plain", "the preset: axis-aligned / oblique", "blotches-0")
+        *("the preset", "plain"),
+        *("the preset, 0.01 min: axis-aligned / oblique", "blotches-0"),
+        *("the preset, 0.02 min: axis-aligned / oblique", "blotches-0"),
     ]
     assert lines[1][2:6] == 4 * [" 1.00 "]
-    assert lines[4][2:6] == 4 * [" 1.00 / 1.00 "]
+    for line in lines[4], lines[6]:
+        assert line[3:6] == [" 1.00 / 1.00 ", " 1.00 / 1.00 ", " 1.50 "]
     found = json.loads((tmp_path / "out" / "table.json").read_text())
     assert {row: len(marks) for row, marks in found.items()} == {"fast": 2, "colors": 2}
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*-0-*.json")}
     recipe.main([*small, "--resume"])
     assert before == {path: path.stat().st_mtime_ns for path in before}
+
+
+def test_the_preset_s_table_ends_with_median_and_worst():
+    def cell(name, value):
+        quality = {"axis": {"gram": (value, 0)}, "oblique": {"gram": (2 * value, 0)}}
+        quality |= {"floor": {"gram": 1.0}, "turned": {"vgg_frechet": 1.0}}
+        return {"exemplar": name, "mark": 5.0, "iterations": int(100 * value), "quality": quality}
+
+    measured = {f"{value}": cell(f"stone{value}", value) for value in (1.0, 4.0, 2.0)} | {
+        "early": cell("a", 9.0) | {"mark": 2.0}
+    }
+    median, worst = recipe.exemplars_table(measured, 5.0).splitlines()[-2:]
+    assert median == "| median | 200 | 2.00 / 4.00 |  |"
+    assert worst == "| worst |  | 4.00 / 8.00 |  |"
 
 
 def test_what_cannot_be_run_is_refused_in_one_line(small, tmp_path, capsys):

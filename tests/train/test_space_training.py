@@ -185,6 +185,25 @@ def test_a_folder_of_photographs_becomes_a_run_from_the_command_line(solidgrain,
     assert run.load_checkpoint()["iteration"] == 2
 
 
+def test_photographs_that_change_across_themselves_are_named(solidgrain, tmp_path, small_presets):
+    folder = photographs(tmp_path / "stones", 2)
+    write(folder / "evening sky.png", np.linspace(0, 1, 150)[:, None, None] * np.ones((150, 140, 3)))
+    outcome = solidgrain("train", "--space", folder, "--out", tmp_path / "run", *SMALL, "--iterations", 1)
+    assert outcome.code == 0, outcome.err
+    assert "warning: 1 of 3 photographs change across themselves (nonstationarity above 0.3): evening sky.png;" in outcome.err
+
+
+def test_held_out_photographs_that_the_warm_start_has_seen_are_named(solidgrain, tmp_path, small_presets):
+    flags = ["--space", photographs(tmp_path / "stones", 3), *SMALL, "--iterations", 1]
+    (tmp_path / "unseen.txt").write_text("stone1.png\n")
+    assert solidgrain("train", *flags, "--out", tmp_path / "first").code == 0
+    flags += ["--warm-start", tmp_path / "first", "--hold-out", tmp_path / "unseen.txt"]
+    outcome = solidgrain("train", *flags, "--out", tmp_path / "second")
+    assert f"1 held-out photographs were trained on by {tmp_path / 'first'}: stone1.png; hold out others" in outcome.err
+    assert open_space_run(tmp_path / "second").settings.warm_start == "first"
+    assert "held-out photographs" not in solidgrain("train", *flags[:-4], "--out", tmp_path / "third").err
+
+
 def test_a_space_has_budgets_and_settings_of_its_own(solidgrain, tmp_path, monkeypatch):
     """Many more iterations, 32 octaves, slower rates; the paper's octaves spread as 2^(i/2)."""
     from solidgrain.train import loop
