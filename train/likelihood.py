@@ -43,17 +43,6 @@ def log_likelihoods(patches: Tensor, truth: Tensor, bandwidths: Sequence[float])
     return torch.cat([_log_density(block, kernels, bandwidths) for block in blocks], 1)
 
 
-def average_log_likelihoods(patches: Tensor, truth: Tensor, bandwidths: Sequence[float]) -> list[float]:
-    """ALL of patches [M, d] under the truth's [N, d], for each of the bandwidths."""
-    return [float(mean) for mean in log_likelihoods(patches, truth, bandwidths).mean(1)]
-
-
-def best_bandwidth(patches: Tensor, truth: Tensor, bandwidths: Sequence[float] = BANDWIDTHS) -> float:
-    """The bandwidth under which held-out patches of the truth [M, d] are most probable: the paper's grid search."""
-    found = average_log_likelihoods(patches, truth, bandwidths)
-    return bandwidths[found.index(max(found))]
-
-
 def _log_density(samples: Tensor, kernels: Tensor, bandwidths: Sequence[float]) -> Tensor:
     """As `log_likelihoods`, of vectors that were centred. Only what is left of a distance above the least is exponentiated,
 
