@@ -146,11 +146,10 @@ inline __m512 activate(const float* sums, float bias) {
 }
 
 // Finished sums of 2 x 2 tiles on their way into the next layer's activations or, from the last hidden layer, into colours.
-// That is done in steps, between the tile operations of the next sums, which leave the vector units idle: two outputs of
-// a tile at a time, or a whole tile of colours.
+// That is done a tile at a time, between the tile operations of the next sums, which leave the vector units idle.
 struct Pending {
   const float* sums = nullptr;  // 4 tiles, 16 outputs x 16 points each
-  int step = 0, steps = 0;
+  int tile = 0, tiles = 0;
   const float* bias[4];
   bfloat* to[4];
   size_t low;
@@ -158,17 +157,19 @@ struct Pending {
   float* rgb[4];                  // 16 of [3, AMX_BLOCK]
 
   template <bool split> void advance(int count) {
-    for (const int end = step + count < steps ? step + count : steps; step < end; step++)
-      if (color_weights[0]) add_color(step);
-      else pass_on<split>(step / 8, 2 * (step % 8));
+    for (const int end = tile + count < tiles ? tile + count : tiles; tile < end; tile++)
+      if (color_weights[0]) add_color();
+      else pass_on<split>();
   }
 
-  template <bool split> void pass_on(int tile, int row) const {
-    const float* from = sums + 256 * tile + 16 * row;
-    store_pairs<split>(to[tile] + 16 * row, low, activate(from, bias[tile][row]), activate(from + 16, bias[tile][row + 1]));
+  template <bool split> void pass_on() const {
+    const float *from = sums + 256 * tile, *added = bias[tile];
+    bfloat* next = to[tile];
+    for (int row = 0; row < 16; row += 2)
+      store_pairs<split>(next + 16 * row, low, activate(from + 16 * row, added[row]), activate(from + 16 * row + 16, added[row + 1]));
   }
 
-  void add_color(int tile) const {
+  void add_color() const {
     float* color = rgb[tile];
     __m512 red = _mm512_loadu_ps(color), green = _mm512_loadu_ps(color + AMX_BLOCK), blue = _mm512_loadu_ps(color + 2 * AMX_BLOCK);
     const float* weights = color_weights[tile];
@@ -187,7 +188,7 @@ struct Pending {
 // Sums of two rows of outputs and two strips, tiles 0 to 3: += weights x activations over `count` tiles of inputs.
 template <bool split, bool three_products>
 inline void multiply(const char* weights, size_t row, size_t low, const bfloat* in, size_t strip, size_t in_low, int count,
-                     Pending& pending, int steps) {
+                     Pending& pending, int passed) {
   for (int k = 0; k < count; k++, weights += 1024, in += TILE) {
     _tile_loadd(4, weights, ROW_BYTES);
     _tile_loadd(5, weights + row, ROW_BYTES);
@@ -204,7 +205,7 @@ inline void multiply(const char* weights, size_t row, size_t low, const bfloat* 
       _tile_loadd(5, weights + low + row, ROW_BYTES);
       multiply_tiles();
     }
-    pending.advance<split>(steps);
+    pending.advance<split>(passed);
   }
 }
 
@@ -225,22 +226,22 @@ void amx_layer(const Sampler& sampler, int l, const bfloat* units, const bfloat*
     const bool both = output + 16 < layer.outputs;  // an odd last row of tiles is computed twice and used once
     const size_t next = both ? row : 0;
     for (int s = 0; s < STRIPS; s += 2) {
-      const int steps = (pending.steps + all - 1) / all;
+      const int passed = (pending.tiles + all - 1) / all;
       memory_barrier();
       _tile_zero(0);
       _tile_zero(1);
       _tile_zero(2);
       _tile_zero(3);
-      multiply<split, split>(weights, next, low, units + s * strip, strip, in_low, own, pending, steps);
-      multiply<split, false>(weights + bin_at, next, 0, bin + s * bin_strip, bin_strip, 0, of_bin, pending, steps);
-      pending.advance<split>(32);
+      multiply<split, split>(weights, next, low, units + s * strip, strip, in_low, own, pending, passed);
+      multiply<split, false>(weights + bin_at, next, 0, bin + s * bin_strip, bin_strip, 0, of_bin, pending, passed);
+      pending.advance<split>(4);
       _tile_stored(0, sums[0], ROW_BYTES);
       _tile_stored(1, sums[0] + 256, ROW_BYTES);
       _tile_stored(2, sums[0] + 512, ROW_BYTES);
       _tile_stored(3, sums[0] + 768, ROW_BYTES);
       memory_barrier();
       pending.sums = sums[0];
-      pending.step = 0, pending.steps = (both ? 4 : 2) * (last ? 1 : 8), pending.low = in_low;
+      pending.tile = 0, pending.tiles = both ? 4 : 2, pending.low = in_low;
       for (int t = 0; t < 4; t++) {
         const int first = output + 16 * (t / 2);
         pending.bias[t] = bias + first;
@@ -272,7 +273,7 @@ template <bool split> void amx_blocks(const Sampler& sampler, const float* eta, 
       bfloat* former = units;
       units = out, out = former;
     }
-    pending.advance<split>(32);
+    pending.advance<split>(4);
     for (int point = first; point < first + AMX_BLOCK && point < count; point++)
       for (int channel = 0; channel < 3; channel++) rgb[3 * point + channel] = block[channel * AMX_BLOCK + point - first];
   }
