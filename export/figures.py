@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from solidgrain.train.exemplar import NONSTATIONARY
+
 if TYPE_CHECKING:
     from solidgrain.train.copying import Copying
     from solidgrain.train.quality import Evaluation
@@ -32,6 +34,8 @@ def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
         spreads = (evaluation.axis[name], evaluation.oblique[name])
         turned = (f"{evaluation.turned[name]:.2f}" for _ in column)
         rows.append((name, f"{floor:.4g}", *turned, *(f"{mean:.2f} ± {deviation:.2f}" for mean, deviation in spreads)))
+    uneven = evaluation.nonstationarity > NONSTATIONARY
+    change = f" The exemplar changes across itself (nonstationarity {evaluation.nonstationarity:.2f}, above {NONSTATIONARY})."
     return Figures(
         f"Distances to the exemplar over its own floor, mean ± standard deviation over {evaluation.slices} slices of "
         f"{evaluation.crop}² pixels, through the runtime:",
@@ -39,5 +43,5 @@ def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
         rows,
         f"Copying: patches are {copying.ratio:.2f} times as far from the exemplar as its halves are from each other, and "
         f"{100 * copying.closer:.1f} % of {copying.patches} come nearer than 99 % of those do "
-        "(near 1 and 1 %: nothing is copied).",
+        f"(near 1 and 1 %: nothing is copied).{change * uneven}",
     )

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from solidgrain.runtime.errors import ExemplarError
 from solidgrain.train.cuts import Sample, as_image, axis_rotation, cut, oblique_rotation, random_place
-from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.exemplar import FloatArray, nonstationarity
 from solidgrain.train.inception import Inception
 from solidgrain.train.losses import gram_difference, gram_matrices
 from solidgrain.train.vgg import STYLE_LAYERS, Vgg
@@ -49,6 +49,7 @@ class Evaluation:
     axis: dict[str, tuple[float, float]]
     oblique: dict[str, tuple[float, float]]
     turned: Measures = field(default_factory=dict)  # the exemplar itself, turned by 90°: far above 1 where it has a direction
+    nonstationarity: float = 0.0  # of the exemplar
 
 
 @torch.no_grad()
@@ -90,6 +91,7 @@ def evaluate(
         axis=ratios(lambda seed, generator: axis_rotation(seed, grain)),
         oblique=ratios(lambda seed, generator: oblique_rotation(generator, grain)),
         turned={name: turned[name] / floor[name] for name in floor},
+        nonstationarity=nonstationarity(exemplar),
     )
 
 

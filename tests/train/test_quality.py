@@ -10,8 +10,10 @@ pytest.importorskip(
     "stlpips_pytorch", reason="the VGG-16 weights come with stlpips-pytorch: pip install 'solidgrain[evaluate]'"
 )
 
+from solidgrain.export.figures import make_figures
 from solidgrain.runtime import ExemplarError, load_space
-from solidgrain.train.quality import disjoint_crops, evaluate, spread_out
+from solidgrain.train.copying import Copying
+from solidgrain.train.quality import Evaluation, disjoint_crops, evaluate, spread_out
 from tests.bench import cells
 from tests.train.conftest import blotches
 
@@ -113,6 +115,12 @@ def test_the_command_refuses_what_it_cannot_measure(solidgrain, toy_folder, tmp_
     outcome = solidgrain("evaluate", toy_folder, "--exemplar", tmp_path / "small.png", *flags)
     assert outcome.code == code
     assert message in outcome.err
+
+
+def test_an_exemplar_that_changes_across_itself_is_said_to():
+    copying = Copying(256, 0.1, 1.0, 0.01)
+    even, uneven = (make_figures(Evaluation(64, 1, {}, {}, {}, {}, value), copying).after for value in (0.2, 0.34))
+    assert uneven == f"{even} The exemplar changes across itself (nonstationarity 0.34, above 0.3)."
 
 
 def test_crops_of_a_large_exemplar_are_all_over_it():
