@@ -22,7 +22,7 @@ from solidgrain.train.processes import Processes
 from solidgrain.train.run import CHECKPOINT, PARTS, Run, RunFolder
 from solidgrain.train.settings import Budget, Settings, rate
 from solidgrain.train.task import Batch, make_task
-from solidgrain.train.watch import Watch, flaw
+from solidgrain.train.watch import SETTLING, Watch, flaw
 
 ALONE = Processes()
 MOST_SETBACKS = 2  # times that a diverged run goes back to its last checkpoint, before it gives up
@@ -64,7 +64,8 @@ class Trainer:
         self.sampler_optimiser = torch.optim.Adam(parameter_groups(self.sampler, self.settings), betas=(0.5, 0.999), fused=True)
         self.reduced_precision = use_bfloat16(self.settings, device)
         self.iteration, self.seconds = 0, 0.0
-        self.watch, self.plateau, self.setbacks = Watch(), Plateau(), 0
+        self.watch = Watch(settles=0 if self.settings.critic_start else SETTLING)
+        self.plateau, self.setbacks = Plateau(), 0
         if processes.rank:
             self._draw_anew(processes.rank)  # the same networks everywhere, batches of one's own
 

@@ -18,6 +18,7 @@ SPIKE = 300.0  # times the lowest mean that a single loss may be: a mean alone i
 PATIENCE = 100  # iterations beyond the limit in a row: it will not come back
 MEMORY = 10  # iterations, of the running means
 UNITS = {"L_style": 2e-2, "L_D": 1.0}  # added to the magnitudes: L_D crosses zero, and neither means much far below
+SETTLING = 1000  # iterations in which a critic from N(0,1) scales its features up, and both losses with them
 FLAT = 0.05  # of the exemplar's deviation: an average whose colours deviate less than that ignores its noise
 
 
@@ -28,6 +29,7 @@ class Watch:
     means: dict[str, float] = field(default_factory=dict)  # running means of the logarithms of the magnitudes
     lowest: dict[str, float] = field(default_factory=dict)  # of the means
     latest: dict[str, float] = field(default_factory=dict)  # logarithms of the latest magnitudes
+    settles: int = 0  # the first iterations, whose magnitudes say nothing
     seen: int = 0  # iterations
     beyond: int = 0  # iterations in a row in which a loss was beyond the limit
 
@@ -41,7 +43,7 @@ class Watch:
             magnitude = math.log(abs(loss) + UNITS[name])
             self.latest[name] = magnitude
             self.means[name] = keep * self.means.get(name, 0.0) + (1 - keep) * magnitude
-            if self.seen >= MEMORY:
+            if self.seen >= max(MEMORY, self.settles):
                 self.lowest[name] = min(self.lowest.get(name, math.inf), self.means[name])
         self.beyond = self.beyond + 1 if self.doubt() else 0
         return self.doubt() if self.beyond >= PATIENCE else ""

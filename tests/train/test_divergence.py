@@ -33,6 +33,7 @@ def little_work(monkeypatch):
     monkeypatch.setattr(loop, "_write_sample", lambda trainer: None)
     monkeypatch.setattr(critic, "CONVOLUTIONS", ((3, 16, 3, True), (16, 32, 3, True), (32, 256, 3, True)))
     monkeypatch.setattr(settings, "PRESETS", settings.PRESETS | {"fast": preset("fast", critic_start="")})
+    monkeypatch.setattr(loop, "SETTLING", 0)
 
 
 @pytest.fixture
@@ -200,8 +201,8 @@ def test_the_command_prints_a_setback_as_one_line_and_goes_on(solidgrain, tmp_pa
     assert "iteration 3: the training diverged" in line
 
 
-def verdicts(styles, critics=None):
-    observed = Watch()
+def verdicts(styles, critics=None, settles=0):
+    observed = Watch(settles=settles)
     return [observed.see(style, critic) for style, critic in zip(styles, critics or [1.0] * len(styles), strict=True)]
 
 
@@ -212,6 +213,16 @@ def test_noisy_losses_and_single_spikes_are_no_divergence():
     critics = torch.randn(2000, generator=draw).mul(3).tolist()
     critics[900] = 5000.0
     assert set(verdicts(styles, critics)) == {""}
+
+
+def test_a_critic_from_noise_may_scale_its_features_up_at_first_and_no_longer():
+    """What the paper's preset does in its first twenty iterations: L_style from 0.5 to 280, L_D from 1 to -230."""
+    grown = [0.5 * 1.37**k for k in range(20)] + [280.0] * 400
+    critics = [-(1.31**k) for k in range(20)] + [-230.0] * 400
+    assert verdicts(grown, critics)[-1] != ""
+    assert set(verdicts(grown, critics, settles=30)) == {""}
+    assert verdicts([*grown, *[280.0 * 2 * LIMIT] * 200], [*critics, *[-230.0] * 200], settles=30)[-1].startswith("L_style")
+    assert verdicts([0.5, math.nan], settles=30)[-1] == "a loss is not finite"
 
 
 @pytest.mark.parametrize("of", ["L_style", "L_D"])
