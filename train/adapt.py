@@ -43,9 +43,9 @@ ITERATIONS = 300
 class Recipe:
     """How theta is moved. Rates are Adam's, at the start."""
 
-    octave_rate: float = 3e-3  # of T_i, relative to its size
-    style_rate: float = 1e-3  # of gamma_l and delta_l
-    noise_rate: float = 1e-3  # of A_l
+    octave_rate: float = 1e-2  # of T_i, relative to its size
+    style_rate: float = 3e-3  # of gamma_l and delta_l
+    noise_rate: float = 3e-3  # of A_l
     warm_up: int = 10  # iterations until rates are whole: Adam's first steps are as long as its others, in no sure direction
     constant: float = 2 / 3  # share of the budget after which rates begin to fall, to a tenth
     average_decay: float = 0.95  # of the moving average that becomes the texture

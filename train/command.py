@@ -167,6 +167,8 @@ def begin(arguments: argparse.Namespace, device: torch.device, first: bool) -> R
         if other:
             taken, left = warm_start(training, other, device)
             print(f"{arguments.warm_start}: took over {taken} of {taken + left} parameter tensors", file=sys.stderr)
+    for line in misgivings(training, arguments.warm_start):
+        print(f"warning: {line}", file=sys.stderr)
     return training
 
 
@@ -201,11 +203,15 @@ def start_space(arguments: argparse.Namespace) -> RunFolder:
     members = read_members(arguments.space, smallest, bool(arguments.skip_unreadable), warn)
     source = Source("", arguments.license or "", arguments.credit or "")
     budget = make_budget(arguments, settings)
-    run = create_space_run(arguments.out, settings, members, held_out_names(arguments.hold_out), source, budget)
-    for line in (about_uneven(run), about_seen(run, arguments.warm_start)):
-        if line:
-            warn(line)
-    return run
+    return create_space_run(arguments.out, settings, members, held_out_names(arguments.hold_out), source, budget)
+
+
+def misgivings(run: RunFolder, warm_start: Path | None) -> list[str]:
+    """What is to be said of a space's photographs; of a single one it has been."""
+    from solidgrain.train.space_run import SpaceRun
+
+    lines = (about_uneven(run), about_seen(run, warm_start)) if isinstance(run, SpaceRun) else ()
+    return [line for line in lines if line]
 
 
 def about_uneven(run: SpaceRun) -> str:
