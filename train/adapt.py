@@ -256,11 +256,10 @@ class Descent:
     def see(self, style: float, average: Theta) -> None:
         self.seen, self.waited = self.seen + 1, self.waited + 1
         self.mean += (style - self.mean) / min(self.seen, self.recipe.memory)
-        if self.seen == self.recipe.memory:
+        full = self.seen == self.recipe.memory
+        if full:
             self.first = self.mean
-        if self.seen < self.recipe.memory:
-            return  # the mean of a few is a matter of luck, and a lucky low would stand for long
-        if self.mean < (1 - self.recipe.gain) * self.lowest:
+        if full or self.mean < (1 - self.recipe.gain) * self.lowest:  # lows of a few are a matter of luck, and do not stand
             self.lowest, self.best, self.waited = self.mean, average.copy(), 0
 
     @property
