@@ -53,7 +53,7 @@ def open_in_space(space: Space, source: str, cut: Cut = WHERE_IT_IS, on_note: No
     if cut != WHERE_IT_IS:
         raise UsageError(f"--patch-scale and --crop: are about photographs, {source} is a texture file; leave them out")
     if not Path(source).is_file():
-        raise UsageError(f"{source}: no such file; expected a texture file ({TEXTURE_SUFFIX}) or a photograph")
+        raise BundleError(f"{source}: no such file; expected a texture file ({TEXTURE_SUFFIX}) or a photograph")
     return space.open(space.owned(read_texture(Path(source))))
 
 
