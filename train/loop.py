@@ -66,6 +66,8 @@ class Trainer:
         self.iteration, self.seconds = 0, 0.0
         self.watch = Watch(settles=0 if self.settings.critic_start else SETTLING)
         self.plateau, self.setbacks = Plateau(), 0
+        self.onlooker: Onlooker | None = None  # until it is needed
+        self.best: dict[str, Tensor] = {}  # the average at the plateau's lowest, where the settings ask for it
         if processes.rank:
             self._draw_anew(processes.rank)  # the same networks everywhere, batches of one's own
 
@@ -161,6 +163,18 @@ class Trainer:
         for average, current in zip(self.average.parameters(), self.sampler.parameters(), strict=True):
             average.lerp_(current, 1 - keep)
 
+    def look(self) -> None:
+        """Let the onlooker judge the average, and keep it if it was never nearer to the exemplar. It is training time, too."""
+        started = time.monotonic()
+        if self.onlooker is None:
+            assert isinstance(self.run, Run)
+            self.onlooker = Onlooker(self.settings, self.run.exemplar, self.device)
+        found = torch.tensor([self.onlooker.distance(self.average), time.monotonic() - started], dtype=torch.float64)
+        distance, taken = self.processes.mean(found.to(self.device)).tolist()
+        self.seconds += taken
+        if self.plateau.see(distance, self.iteration) and self.settings.keep_best:
+            self.best = {name: value.clone() for name, value in self.average.state_dict().items()}
+
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.reduced_precision)
 
@@ -171,7 +185,7 @@ class Trainer:
         streams = self.processes.gathered(self.generator.get_state())
         if self.processes.first:
             random = {"generator": streams[0], "other_generators": streams[1:]}
-            self.run.save_checkpoint(parts | progress | caution | random)
+            self.run.save_checkpoint(parts | {"best": self.best} | progress | caution | random)
         self.processes.gathered(None)  # nobody goes on, and perhaps back to it, before it is there
 
     def load(self) -> None:
@@ -185,6 +199,7 @@ class Trainer:
             self.generator.set_state(self._stream(state))
             self.watch = Watch(**state.get("watch", {}))  # runs of earlier versions have none
             self.plateau = Plateau(**state.get("plateau", {}))
+            self.best = state.get("best", {})
         except (RuntimeError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0]
             raise TrainingError(f"{self.run.folder}: the checkpoint does not fit the run or --device ({reason})") from error
@@ -260,10 +275,10 @@ def train(
     if processes.first:
         run.rewind_stats(trainer.iteration)
     settings, report = run.settings, None
-    onlooker = _call_onlooker(trainer) if budget.until_plateau else None
+    judged = settings.keep_best or budget.until_plateau
 
     while not budget.done(trainer.iteration, trainer.seconds) and not processes.any(should_stop()):
-        if onlooker and processes.any(trainer.plateau.reached(trainer.iteration)):
+        if budget.until_plateau and processes.any(trainer.plateau.reached(trainer.iteration)):
             break
         report = trainer.step()
         due = trainer.iteration % settings.checkpoint_every == 0
@@ -282,8 +297,8 @@ def train(
             on_report(report)
         if trainer.iteration % settings.sample_every == 0 and processes.first:
             _write_sample(trainer)
-        if onlooker and trainer.iteration % EVERY == 0:
-            trainer.plateau.see(onlooker.distance(trainer.average), trainer.iteration)
+        if judged and trainer.iteration % EVERY == 0:
+            trainer.look()
         if due and not trainer.watch.doubt():
             trainer.save()
     doubt = trainer.watch.doubt() or trainer.flaw()
@@ -294,13 +309,6 @@ def train(
             on_warning(f"iteration {trainer.iteration} is not saved ({doubt}); the last checkpoint stays")
         _write_sample(trainer)
     return Ending(trainer.iteration, not doubt, report)
-
-
-def _call_onlooker(trainer: Trainer) -> Onlooker:
-    """What tells a plateau, from now on."""
-    assert isinstance(trainer.run, Run)
-    trainer.plateau.take_up(trainer.iteration)
-    return Onlooker(trainer.settings, trainer.run.exemplar, trainer.device)
 
 
 def parameter_groups(model: nn.Module, settings: Settings) -> list[dict[str, Any]]:

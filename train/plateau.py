@@ -1,9 +1,10 @@
-"""When a training no longer gets better, told by a critic that no longer learns.
+"""When a training was at its best, and when it no longer gets better, told by a critic that no longer learns.
 
 Neither loss says so: both are measured by a D that moves. The embedded space's critic stands still. Every `EVERY` iterations it
 looks at slices of the moving average, and their mean Gram matrices are compared with those of the exemplar's crops. The
-distance falls as a training gets better; when it has not fallen for half as long as it took to get there, that is a
-plateau. The paper trains for a fixed number of iterations.
+distance falls as a training gets better, but not steadily: D and S chase each other. The average at the lowest is worth
+keeping; when there was no lower one for half as long as it took to get there, that is a plateau. The paper trains for a
+fixed number of iterations, and keeps the last.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from solidgrain.train.noise import draw_tables
 from solidgrain.train.settings import FAST, Settings
 from solidgrain.train.slices import draw_slices
 
-EVERY = 50  # iterations
+EVERY = 25  # iterations
 BATCHES = 8  # of slices, the same ones each time
 GAIN = 0.02  # by which a distance must undercut the lowest before it
 SHARE = 0.5  # of the iterations until the lowest, that may pass without another
@@ -39,18 +40,21 @@ class Plateau:
     at: int = 0  # iteration
     looked: int = 0  # the last time
 
-    def see(self, distance: float, iteration: int) -> None:
-        if distance < (1 - GAIN) * self.lowest:
+    def see(self, distance: float, iteration: int) -> bool:
+        """Whether it is the lowest since looks began to follow each other."""
+        lower = self._stale(iteration) or distance < (1 - GAIN) * self.lowest
+        if lower:
             self.lowest, self.at = distance, iteration
         self.looked = iteration
+        return lower
 
     def reached(self, iteration: int) -> bool:
-        return math.isfinite(self.lowest) and iteration - self.at >= max(LEAST, SHARE * self.at)
+        waited = math.isfinite(self.lowest) and iteration - self.at >= max(LEAST, SHARE * self.at)
+        return waited and not self._stale(iteration)
 
-    def take_up(self, iteration: int) -> None:
-        """Forget what was seen before a stretch of training without an onlooker."""
-        if iteration - self.looked > EVERY:
-            self.lowest, self.at = math.inf, 0
+    def _stale(self, iteration: int) -> bool:
+        """Whether a stretch of training has gone by without a look."""
+        return iteration - self.looked > EVERY
 
     def state(self) -> dict[str, Any]:
         return asdict(self)

@@ -68,6 +68,7 @@ class Settings:
     sampler_half_life: float = 400.0
     octave_rate: float = 1.0  # of T_i and of the network Q that makes them, over the sampler's
     average_decay: float = 0.999  # at most, of the exponential moving average whose weights are all output
+    keep_best: bool = False  # the result is that average when it was nearest to the exemplar (plateau.py), else the last
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
     # Reporting
@@ -120,6 +121,7 @@ FAST = Settings(
     principal_colors=True,
     relative_gram=True,
     octave_rate=0.1,
+    keep_best=True,
 )
 """Tuned for few CPU minutes. How it departs from the paper, and why, is in docs/training.md."""
 
@@ -154,6 +156,7 @@ PRESETS = {
         **SPACE,
         color_moments=True,
         pooled_gram=True,
+        keep_best=False,
         sampler_rate=1e-3,
         sampler_half_life=6000.0,
         critic_rate=2e-3,

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from solidgrain.export.from_run import export_run
 from solidgrain.train import loop, plateau
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.plateau import EVERY, LEAST, Onlooker, Plateau
-from solidgrain.train.run import open_run
+from solidgrain.train.run import open_run, result
 from solidgrain.train.settings import Budget
 from tests.train.conftest import blotches
 from tests.train.test_training import CPU, assert_same_checkpoint, new_run
@@ -26,15 +27,16 @@ def seen(distances):
 
 
 def test_it_waits_half_as_long_as_it_took_to_get_there():
-    falling = seen(np.linspace(1, 0.1, 20))  # the lowest after 1000 iterations
-    assert falling.at == 20 * EVERY
+    falling = seen([*np.linspace(1, 0.1, 40), *[0.1] * 20])  # the lowest after 1000 iterations
+    assert falling.at == 40 * EVERY == 1000
     assert not falling.reached(1499)
     assert falling.reached(1500)
 
 
 def test_it_waits_long_enough_at_the_start():
-    assert not seen([0.5]).reached(EVERY + LEAST - 1)
-    assert seen([0.5, 0.6, 0.7]).reached(EVERY + LEAST)
+    waiting = seen([0.5, *[0.6] * (LEAST // EVERY)])
+    assert not waiting.reached(EVERY + LEAST - 1)
+    assert waiting.reached(EVERY + LEAST)
 
 
 def test_a_hair_lower_is_no_progress():
@@ -65,7 +67,7 @@ def test_the_onlooker_tells_better_slices_from_worse(tmp_path, photograph):
 
 @pytest.fixture
 def told(monkeypatch):
-    """An onlooker that is told what to see: nothing ever gets better after the second look."""
+    """An onlooker that is told what to see: nothing ever gets better after the second look, which is at iteration 4."""
     looks = []
 
     class Told:
@@ -74,7 +76,7 @@ def told(monkeypatch):
 
         def distance(self, average):
             looks.append(average)
-            return 0.5 if len(looks) == 1 else 0.4
+            return {1: 0.5, 2: 0.4}.get(len(looks), 0.45)
 
     monkeypatch.setattr(loop, "Onlooker", Told)
     monkeypatch.setattr(loop, "EVERY", 2)
@@ -101,13 +103,13 @@ def test_a_training_stops_on_a_plateau_and_resumes_to_the_same(tmp_path, photogr
 def test_nothing_is_a_plateau_that_was_not_looked_at(tmp_path, photograph, told):
     assert not Plateau().reached(10_000)
     stale = seen([0.1])
-    stale.take_up(2 * EVERY)
-    assert stale.lowest == 0.1
-    stale.take_up(10_000)
     assert not stale.reached(10_000)
+    assert stale.see(0.2, 10_000)
+    assert (stale.lowest, stale.at) == (0.2, 10_000)
 
-    run = new_run(tmp_path / "run", photograph)
+    run = new_run(tmp_path / "run", photograph, keep_best=False)
     train(run, Budget(iterations=12), CPU)
+    assert not told
     ending = train(open_run(run.folder), Budget(iterations=50, until_plateau=True), CPU)
     assert len(told) > 1
     assert ending.iteration > 12
@@ -117,7 +119,47 @@ def test_without_being_asked_it_goes_on(tmp_path, photograph, told):
     run = new_run(tmp_path / "run", photograph)
     train(run, Budget(iterations=12), CPU)
     assert run.load_checkpoint()["iteration"] == 12
+
+
+def test_what_was_nearest_is_the_result(tmp_path, photograph, told):
+    short = new_run(tmp_path / "short", photograph)
+    train(short, Budget(iterations=4), CPU)
+    told.clear()
+    long = new_run(tmp_path / "long", photograph)
+    train(long, Budget(iterations=9), CPU)
+
+    nearest, state = short.load_checkpoint()["average"], long.load_checkpoint()
+    assert state["plateau"]["at"] == 4
+    assert all(torch.equal(value, nearest[name]) for name, value in result(state).items())
+    assert any(not torch.equal(value, nearest[name]) for name, value in state["average"].items())
+
+
+def test_the_bundle_says_which_iteration_was_nearest(tmp_path, photograph, told):
+    run = new_run(tmp_path / "run", photograph)
+    train(run, Budget(iterations=9), CPU)
+    bundle = export_run(run.folder, tmp_path / "bundle")
+    training = json.loads((bundle / "manifest.json").read_text("utf-8"))["training"]
+    assert (training["iterations"], training["kept"]) == (9, 4)
+    assert "| iterations | 9; the weights of iteration 4, the nearest" in (bundle / "card.md").read_text("utf-8")
+
+
+def test_nobody_looks_where_the_last_is_the_result(tmp_path, photograph, told):
+    run = new_run(tmp_path / "run", photograph, keep_best=False)
+    train(run, Budget(iterations=9), CPU)
+    state = run.load_checkpoint()
     assert not told
+    assert result(state) is state["average"]
+
+
+def test_what_was_nearest_survives_a_stop(tmp_path, photograph, told):
+    whole = new_run(tmp_path / "whole", photograph)
+    train(whole, Budget(iterations=9), CPU)
+    told.clear()
+    parts = new_run(tmp_path / "parts", photograph)
+    train(parts, Budget(iterations=5), CPU)
+    train(open_run(parts.folder), Budget(iterations=9), CPU)
+    assert_same_checkpoint(parts.folder, whole.folder)
+    assert result(parts.load_checkpoint()) is not parts.load_checkpoint()["average"]
 
 
 def test_the_flag_is_part_of_the_run(tmp_path, photograph, solidgrain, told):
