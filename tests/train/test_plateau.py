@@ -121,22 +121,32 @@ def test_without_being_asked_it_goes_on(tmp_path, photograph, told):
     assert run.load_checkpoint()["iteration"] == 12
 
 
-def test_what_was_nearest_is_the_result(tmp_path, photograph, told):
-    short = new_run(tmp_path / "short", photograph)
-    train(short, Budget(iterations=4), CPU)
+def watched(folder, photograph, told, *stops):
+    """A run that was stopped after so many iterations, before an onlooker that begins anew."""
     told.clear()
-    long = new_run(tmp_path / "long", photograph)
-    train(long, Budget(iterations=9), CPU)
+    run = new_run(folder, photograph)
+    for iterations in stops:
+        train(open_run(folder), Budget(iterations=iterations), CPU)
+    return run
 
-    nearest, state = short.load_checkpoint()["average"], long.load_checkpoint()
+
+def test_what_was_nearest_is_the_result(tmp_path, photograph, told):
+    nearest = watched(tmp_path / "short", photograph, told, 4).load_checkpoint()["average"]
+    state = watched(tmp_path / "long", photograph, told, 9).load_checkpoint()
     assert state["plateau"]["at"] == 4
     assert all(torch.equal(value, nearest[name]) for name, value in result(state).items())
     assert any(not torch.equal(value, nearest[name]) for name, value in state["average"].items())
 
 
+def test_what_was_nearest_survives_a_stop(tmp_path, photograph, told):
+    whole = watched(tmp_path / "whole", photograph, told, 9)
+    parts = watched(tmp_path / "parts", photograph, told, 5, 9)
+    assert parts.load_checkpoint()["best"]
+    assert_same_checkpoint(parts.folder, whole.folder)
+
+
 def test_the_bundle_says_which_iteration_was_nearest(tmp_path, photograph, told):
-    run = new_run(tmp_path / "run", photograph)
-    train(run, Budget(iterations=9), CPU)
+    run = watched(tmp_path / "run", photograph, told, 9)
     bundle = export_run(run.folder, tmp_path / "bundle")
     training = json.loads((bundle / "manifest.json").read_text("utf-8"))["training"]
     assert (training["iterations"], training["kept"]) == (9, 4)
@@ -149,17 +159,6 @@ def test_nobody_looks_where_the_last_is_the_result(tmp_path, photograph, told):
     state = run.load_checkpoint()
     assert not told
     assert result(state) is state["average"]
-
-
-def test_what_was_nearest_survives_a_stop(tmp_path, photograph, told):
-    whole = new_run(tmp_path / "whole", photograph)
-    train(whole, Budget(iterations=9), CPU)
-    told.clear()
-    parts = new_run(tmp_path / "parts", photograph)
-    train(parts, Budget(iterations=5), CPU)
-    train(open_run(parts.folder), Budget(iterations=9), CPU)
-    assert_same_checkpoint(parts.folder, whole.folder)
-    assert result(parts.load_checkpoint()) is not parts.load_checkpoint()["average"]
 
 
 def test_the_flag_is_part_of_the_run(tmp_path, photograph, solidgrain, told):
