@@ -161,7 +161,7 @@ def test_a_budget_of_seconds_ends_it(run):
     run(1)  # what is reserved for the last measuring is as long as the first one took: slow, if it were the process's first
     found = run(budget=Budget(minutes=0.5 / 60))
     assert found.ended == "budget"
-    assert 0.5 < found.seconds < 30
+    assert 0.25 < found.seconds < 30  # a little less than 0.5 where the last measuring is faster than what was reserved for it
 
 
 def test_nan_ends_it_with_the_best_before(run, companion):
