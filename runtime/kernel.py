@@ -31,8 +31,8 @@ from solidgrain.runtime.texture_file import TextureData
 from solidgrain.runtime.workers import Task
 
 ABI = 1  # SOLIDGRAIN_ABI of native/kernel.h
-PATHS = ("amx", "avx512", "avx2", "portable")
-BFLOAT16_PATHS = ("amx",)
+PATHS = ("amx", "avx512bf16", "avx512", "avx2", "portable")
+BFLOAT16_PATHS = ("amx", "avx512bf16")
 BRICK = 4096  # voxels
 WORK_PER_TASK = 4 * BRICK * 128**2  # points times squared width: some milliseconds, a fifth of a second on the slowest path
 STEEPEST = 2.0**13  # texels per pixel: times the farthest point, below 2^53

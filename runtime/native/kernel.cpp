@@ -23,12 +23,16 @@
 namespace {
 
 #if defined(__x86_64__)
+bool has_avx512bf16() {
+  unsigned a, b, c, d;
+  return __get_cpuid_count(7, 1, &a, &b, &c, &d) && a >> 5 & 1;
+}
+
 // Whether AMX is there, with bfloat16, and the system lets this process use it.
 bool has_amx() {
 #if defined(__linux__)
   unsigned a, b, c, d;
   if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(d >> 22 & 1) || !(d >> 24 & 1)) return false;
-  if (!__get_cpuid_count(7, 1, &a, &b, &c, &d) || !(a >> 5 & 1)) return false;  // AVX-512 BF16, to convert
   constexpr int request_permission = 0x1023, tile_data = 18;
   return syscall(SYS_arch_prctl, request_permission, tile_data) == 0;
 #else
@@ -40,11 +44,16 @@ bool runs(const Path& path) {
   static const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
   static const bool avx512 = avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
                              __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
-  static const bool amx = avx512 && has_amx();
-  return &path == &amx_path ? amx : &path == &avx512_path ? avx512 : &path == &avx2_path ? avx2 : true;
+  static const bool avx512bf16 = avx512 && has_avx512bf16();
+  static const bool amx = avx512bf16 && has_amx();  // it converts by AVX-512 BF16
+  return &path == &amx_path          ? amx
+         : &path == &avx512bf16_path ? avx512bf16
+         : &path == &avx512_path     ? avx512
+         : &path == &avx2_path       ? avx2
+                                     : true;
 }
 
-const Path* const paths[] = {&amx_path, &avx512_path, &avx2_path, &portable_path};
+const Path* const paths[] = {&amx_path, &avx512bf16_path, &avx512_path, &avx2_path, &portable_path};
 #else
 bool runs(const Path&) { return true; }
 const Path* const paths[] = {&portable_path};

@@ -22,7 +22,7 @@ struct SamplerDescription {
   int32_t octaves;        // n, in four equal bins; a multiple of 8, at most 128
   int32_t width;          // m, units of a hidden layer; a multiple of 16
   int32_t hidden_layers;  // 4 or more; bin l enters layer l = 0 .. 3
-  int32_t bfloat16;       // 0: float32 results; 1: bfloat16 tables, activations and weights (path "amx" only)
+  int32_t bfloat16;       // 0: float32 results; 1: bfloat16 tables, activations and weights (paths "amx" and "avx512bf16")
   int32_t tiled;          // 0: every octave repeats after 64 texels; 1: on its `lattice`
   const double* transforms;  // [n, 3, 3], T_i
   const double* offsets;     // [n, 3]
@@ -38,7 +38,8 @@ struct SamplerDescription {
 constexpr int32_t SOLIDGRAIN_ABI = 1;
 SOLIDGRAIN_API int32_t solidgrain_abi();
 
-// The paths that this build and this processor have, best first, comma-separated: some of "amx,avx512,avx2,portable".
+// The paths that this build and this processor have, best first, comma-separated: some of
+// "amx,avx512bf16,avx512,avx2,portable".
 SOLIDGRAIN_API const char* solidgrain_paths();
 
 // A sampler that runs on the named path, or null if there is no such path here or not enough memory.

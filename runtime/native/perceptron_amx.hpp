@@ -12,6 +12,7 @@
 #include <cstring>
 
 #include "sampler.hpp"
+#include "simd_avx512bf16.hpp"
 
 namespace {
 
@@ -97,13 +98,6 @@ struct __attribute__((packed)) TileShapes {
   uint16_t row_bytes[16] = {};
   uint8_t rows[16] = {};
 };
-
-// Two rows of 16 points, inputs 2k and 2k + 1, as one row of pairs.
-inline __m512i pairs(__m512 even, __m512 odd) {
-  const __m512i order = _mm512_set_epi16(31, 15, 30, 14, 29, 13, 28, 12, 27, 11, 26, 10, 25, 9, 24, 8,
-                                         23, 7, 22, 6, 21, 5, 20, 4, 19, 3, 18, 2, 17, 1, 16, 0);
-  return _mm512_permutexvar_epi16(order, (__m512i)_mm512_cvtne2ps_pbh(odd, even));
-}
 
 // Stores a row of pairs; split, the high parts there and the low parts `low` numbers further on.
 template <bool split> inline void store_pairs(bfloat* to, size_t low, __m512 even, __m512 odd) {

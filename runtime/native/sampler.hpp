@@ -65,5 +65,5 @@ struct Path {
 
 extern const Path portable_path;
 #if defined(__x86_64__)
-extern const Path avx2_path, avx512_path, amx_path;
+extern const Path avx2_path, avx512_path, avx512bf16_path, amx_path;
 #endif
