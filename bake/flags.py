@@ -100,7 +100,7 @@ def _add_work(group: argparse._ArgumentGroup) -> None:
         help="the bundle that a texture file belongs to, or the space that encodes a photograph (stone)",
     )
     add("--provider", default="auto", help="auto: the fused kernel, else ONNX Runtime; kernel, cpu, cuda, directml, … (auto)")
-    add("--precision", choices=("float32", "bfloat16"), help="bfloat16: faster, needs AMX (float32)")
+    add("--precision", choices=("float32", "bfloat16"), help="bfloat16: faster, needs AMX or AVX-512 BF16 (float32)")
     add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
     existing = group.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace outputs that exist")

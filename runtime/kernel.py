@@ -3,7 +3,7 @@
 It is optional. Where it was not built, cannot be loaded or does not know a bundle's graph, the runtime evaluates through ONNX
 Runtime, and the reason is there to be asked for. Two environment variables, for tests and for diagnosis:
 
-    SOLIDGRAIN_KERNEL          off, or the one path to use: amx, avx512, avx2 or portable
+    SOLIDGRAIN_KERNEL          off, or the one path to use: amx, avx512bf16, avx512, avx2 or portable
     SOLIDGRAIN_KERNEL_LIBRARY  a library file to load instead of the installed one
 """
 
@@ -75,8 +75,8 @@ def choose_path(precision: str) -> str:
     path = wanted or offered[0]
     if precision == "bfloat16" and path not in BFLOAT16_PATHS:
         raise KernelMissingError(
-            f"precision 'bfloat16': needs AMX, which this processor lacks or the system keeps from this process "
-            f"(the fused kernel runs on {path}); use float32"
+            f"precision 'bfloat16': needs AMX or AVX-512 BF16, which this processor lacks or the system keeps from this "
+            f"process (the fused kernel runs on {path}); use float32"
         )
     return path
 

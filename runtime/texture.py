@@ -48,8 +48,8 @@ def load_texture(
     embedded name. `provider` "auto" is the fused kernel, or ONNX Runtime on the CPU where there is no kernel for this
     machine or bundle (`Texture.provider` and `provider_note` say which and why); "kernel" insists; "cpu", "cuda",
     "directml", "coreml", "openvino" are ONNX Runtime's execution providers. One that cannot be had is an error. `precision`
-    "bfloat16" is faster where the processor has AMX, and an error elsewhere. `threads` of 0 uses every processor that this
-    process may use. Raises BundleError or ProviderError; for a space, which is no texture, BundleError.
+    "bfloat16" is faster where the processor has AMX or AVX-512 BF16, and an error elsewhere. `threads` of 0 uses every
+    processor that this process may use. Raises BundleError or ProviderError; for a space, which is no texture, BundleError.
     """
     data, owner = _resolve(os.fspath(source), None if bundle is None else os.fspath(bundle))
     return open_texture(data, owner, provider, precision, make_workers(threads))

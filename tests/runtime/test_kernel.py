@@ -31,6 +31,9 @@ except ProviderError as error:
         raise
 needs_kernel = pytest.mark.skipif(not PATHS, reason="no fused kernel, and no C++ compiler to build it with")
 every_path = pytest.mark.parametrize("path", PATHS or [pytest.param("none", marks=needs_kernel)])
+BFLOAT16_PATHS = [path for path in PATHS if path in kernel.BFLOAT16_PATHS]
+no_bfloat16 = pytest.mark.skip(reason="this processor multiplies no bfloat16: neither AMX nor AVX-512 BF16")
+every_bfloat16_path = pytest.mark.parametrize("path", BFLOAT16_PATHS or [pytest.param("none", marks=no_bfloat16)])
 FLOAT32 = 1e-4  # what is promised; AMX, which sums split bfloat16, comes to a third of it
 
 
@@ -146,12 +149,12 @@ def test_it_agrees_with_the_graph(loaded, path):
         np.testing.assert_allclose(texture.grid((3, 40, 50), **options), graph.grid((3, 40, 50), **options), atol=FLOAT32)
 
 
-@pytest.mark.skipif("amx" not in PATHS, reason="this processor has no AMX")
+@every_bfloat16_path
 @pytest.mark.parametrize("tile", ["", "xyz"])
-def test_bfloat16_is_close_to_float32(loaded, tile):
+def test_bfloat16_is_close_to_float32(loaded, path, tile):
     for octaves in (16, 32):
         weights = toy_weights(octaves, 128)
-        exact, fast = (loaded("amx", weights, precision=precision) for precision in ("float32", "bfloat16"))
+        exact, fast = (loaded(path, weights, precision=precision) for precision in ("float32", "bfloat16"))
         assert fast.precision == "bfloat16"
         difference = fast.grid((16, 64, 64), tile=tile) - exact.grid((16, 64, 64), tile=tile)
         assert -10 * np.log10((difference.astype(float) ** 2).mean()) >= 45
@@ -159,13 +162,13 @@ def test_bfloat16_is_close_to_float32(loaded, tile):
         assert np.abs(difference).max() > 0
 
 
-@pytest.mark.skipif("amx" not in PATHS, reason="this processor has no AMX")
+@every_bfloat16_path
 @pytest.mark.parametrize("tile", ["", "xz"])
 @pytest.mark.parametrize("width", [16, 48, 112, 160])
-def test_bfloat16_is_the_formula_in_points_and_in_grids_of_any_width(loaded, width, tile):
+def test_bfloat16_is_the_formula_in_points_and_in_grids_of_any_width(loaded, path, width, tile):
     for octaves in (16, 32):
         weights = toy_weights(octaves, width, seed=width)
-        texture = loaded("amx", weights, precision="bfloat16")
+        texture = loaded(path, weights, precision="bfloat16")
         volume = texture.grid((2, 3, 37), 7, origin=(1e6, -3, 0.25), tile=tile)
         z, y, x = np.indices(volume.shape[:3]).reshape(3, -1)
         points = np.stack([1e6 + (x + 0.5), -3 + (y + 0.5), 0.25 + (z + 0.5)], axis=1)
@@ -176,19 +179,26 @@ def test_bfloat16_is_the_formula_in_points_and_in_grids_of_any_width(loaded, wid
         np.testing.assert_allclose(volume.reshape(-1, 3)[::5], expected_colors(weights, some, 7, tiling), atol=0.02)
 
 
-@pytest.mark.skipif("amx" not in PATHS, reason="this processor has no AMX")
+@every_bfloat16_path
 @pytest.mark.parametrize("name", embedded_names())
-def test_embedded_textures_in_bfloat16_are_above_45_decibels(name):
+def test_embedded_textures_in_bfloat16_are_above_45_decibels(path, name, monkeypatch):
+    monkeypatch.setenv("SOLIDGRAIN_KERNEL", path)
     exact, fast = load(name), load(name, precision="bfloat16")
     difference = (fast.grid((32, 96, 96)) - exact.grid((32, 96, 96))).astype(float)
     assert -10 * np.log10((difference**2).mean()) >= 45
 
 
-@pytest.mark.skipif("amx" not in PATHS, reason="this processor has no AMX")
-def test_bfloat16_neither_depends_on_cuts_and_threads(loaded):
-    texture = loaded("amx", toy_weights(), precision="bfloat16", threads=3)
+@every_bfloat16_path
+def test_bfloat16_neither_depends_on_cuts_and_threads(loaded, path):
+    texture = loaded(path, toy_weights(), precision="bfloat16", threads=3)
     whole = texture.grid((20, 33, 50), tile="x")
     assert np.array_equal(np.concatenate([slab for _, slab in texture.slabs((20, 33, 50), tile="x", slab=3)]), whole)
+
+
+@pytest.mark.skipif("avx512bf16" not in PATHS, reason="this processor has no AVX-512 BF16")
+def test_avx512_gives_the_same_bits_with_bf16_and_without(loaded):
+    with_it, without = (loaded(path, toy_weights()).grid((3, 40, 50), 7) for path in ("avx512bf16", "avx512"))
+    assert np.array_equal(with_it, without)
 
 
 @pytest.mark.parametrize("provider", ["auto", "cpu"])
@@ -287,9 +297,9 @@ def test_the_environment_chooses_the_path(toy_folder, monkeypatch):
 
 
 @needs_kernel
-def test_bfloat16_without_amx_is_an_error(toy_folder, monkeypatch):
+def test_bfloat16_is_an_error_where_nothing_multiplies_it(toy_folder, monkeypatch):
     monkeypatch.setenv("SOLIDGRAIN_KERNEL", "portable")
-    with pytest.raises(ProviderError, match="needs AMX"):
+    with pytest.raises(ProviderError, match="needs AMX or AVX-512 BF16"):
         load(toy_folder, precision="bfloat16")
     with pytest.raises(ProviderError, match="ONNX Runtime has float32 only"):
         load(toy_folder, precision="bfloat16", provider="cpu")
