@@ -16,7 +16,7 @@ def write_card(name: str, training: dict[str, Any]) -> str:
         ("patches", f"{settings['batch']} of {settings['patch']}² pixels per iteration"),
         ("octaves", f"{settings['octaves']}, span {settings['octave_span']:g}"),
         ("slices", "turned freely" if settings["grain"] == "none" else f"turned about the {settings['grain']} axis only"),
-        ("iterations", f"{training['iterations']:,}" + _kept(training)),
+        ("iterations", f"{training['iterations']:,}"),
         ("minutes", f"{training['minutes']:g}"),
         ("trained by", f"solidgrain {training['revision']}"),
     ]
@@ -37,12 +37,6 @@ def write_card(name: str, training: dict[str, Any]) -> str:
     kind = "A space of solid textures" if settings.get("latent") else "A solid texture"
     lines = [f"# {name}", "", f"{kind}, trained on:", "", *exemplars, "", "| | |", "|---|---|"]
     return "\n".join([*lines, *(f"| {label} | {value} |" for label, value in rows), ""])
-
-
-def _kept(training: dict[str, Any]) -> str:
-    """Which of its weights these are, if not the last."""
-    kept = training.get("kept", training["iterations"])
-    return "" if kept == training["iterations"] else f"; the weights of iteration {kept:,}, the nearest to the photograph"
 
 
 def _reduced(entry: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.colors import settle_mean
-from solidgrain.train.run import Run, RunFolder, open_run, result
+from solidgrain.train.run import Run, RunFolder, open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import to_json
 from solidgrain.train.slices import UNIT
@@ -36,7 +36,7 @@ def export_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = Fa
     average = make_task(run, torch.device("cpu")).make_model(torch.Generator())
     assert isinstance(average, Sampler)
     try:
-        average.load_state_dict(result(state))
+        average.load_state_dict(state["average"])
     except (RuntimeError, TypeError) as error:
         raise TrainingError(f"{run_folder}: the checkpoint does not fit the run's settings; start the run again") from error
     settle_mean(average, run.exemplar)
@@ -117,11 +117,9 @@ def random_points(seed: int) -> DoubleArray:
 
 def provenance(run: Run, state: dict[str, Any]) -> dict[str, Any]:
     """What the manifest says about the training."""
-    kept = {"kept": state["plateau"]["at"]} if state.get("best") else {}  # the iteration whose weights these are
     return {
         "exemplars": [{**vars(run.source), "sha256": run.sha256}],
         "iterations": state["iteration"],
-        **kept,
         "minutes": round(state["seconds"] / 60, 1),
         "revision": run.revision,
         "settings": to_json(run.settings),

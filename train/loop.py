@@ -67,7 +67,6 @@ class Trainer:
         self.watch = Watch(settles=0 if self.settings.critic_start else SETTLING)
         self.plateau, self.setbacks = Plateau(), 0
         self.onlooker: Onlooker | None = None  # until it is needed
-        self.best: dict[str, Tensor] = {}  # the average at the plateau's lowest, where the settings ask for it
         if processes.rank:
             self._draw_anew(processes.rank)  # the same networks everywhere, batches of one's own
 
@@ -145,7 +144,7 @@ class Trainer:
             on_fake, of_fake = self.judge(fake)
             with torch.no_grad():
                 _, of_real = self.judge(real)
-        style = style_loss(of_real, of_fake, settings.gram_groups, settings.compares_relatively)
+        style = style_loss(of_real, of_fake, settings.gram_groups, settings.compares_relatively, settings.gram_energy)
         return style, on_fake.float().mean()
 
     def _set_rates(self) -> None:
@@ -164,7 +163,7 @@ class Trainer:
             average.lerp_(current, 1 - keep)
 
     def look(self) -> None:
-        """Let the onlooker judge the average, and keep it if it was never nearer to the exemplar. It is training time, too."""
+        """Let the onlooker judge the average. It is training time, too."""
         started = time.monotonic()
         if self.onlooker is None:
             assert isinstance(self.run, Run)
@@ -172,8 +171,7 @@ class Trainer:
         found = torch.tensor([self.onlooker.distance(self.average), time.monotonic() - started], dtype=torch.float64)
         distance, taken = self.processes.mean(found.to(self.device)).tolist()
         self.seconds += taken
-        if self.plateau.see(distance, self.iteration) and self.settings.keep_best:
-            self.best = {name: value.clone() for name, value in self.average.state_dict().items()}
+        self.plateau.see(distance, self.iteration)
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.reduced_precision)
@@ -185,7 +183,7 @@ class Trainer:
         streams = self.processes.gathered(self.generator.get_state())
         if self.processes.first:
             random = {"generator": streams[0], "other_generators": streams[1:]}
-            self.run.save_checkpoint(parts | {"best": self.best} | progress | caution | random)
+            self.run.save_checkpoint(parts | progress | caution | random)
         self.processes.gathered(None)  # nobody goes on, and perhaps back to it, before it is there
 
     def load(self) -> None:
@@ -199,7 +197,6 @@ class Trainer:
             self.generator.set_state(self._stream(state))
             self.watch = Watch(**state.get("watch", {}))  # runs of earlier versions have none
             self.plateau = Plateau(**state.get("plateau", {}))
-            self.best = state.get("best", {})
         except (RuntimeError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0]
             raise TrainingError(f"{self.run.folder}: the checkpoint does not fit the run or --device ({reason})") from error
@@ -275,7 +272,6 @@ def train(
     if processes.first:
         run.rewind_stats(trainer.iteration)
     settings, report = run.settings, None
-    judged = settings.keep_best or budget.until_plateau
 
     while not budget.done(trainer.iteration, trainer.seconds) and not processes.any(should_stop()):
         if budget.until_plateau and processes.any(trainer.plateau.reached(trainer.iteration)):
@@ -297,7 +293,7 @@ def train(
             on_report(report)
         if trainer.iteration % settings.sample_every == 0 and processes.first:
             _write_sample(trainer)
-        if judged and trainer.iteration % EVERY == 0:
+        if budget.until_plateau and trainer.iteration % EVERY == 0:
             trainer.look()
         if due and not trainer.watch.doubt():
             trainer.save()

@@ -41,18 +41,39 @@ def gradient_penalty(critic: Critic, real: Tensor, fake: Tensor, generator: torc
     return penalty
 
 
-def style_loss(real: Sequence[Tensor], fake: Sequence[Tensor], groups: int, relative: bool = False) -> Tensor:
+def style_loss(
+    real: Sequence[Tensor], fake: Sequence[Tensor], groups: int, relative: bool = False, energy: bool = False
+) -> Tensor:
     """L_style of Eq. 4: the mean over layers of the mean absolute difference of Gram matrices.
 
     The Gram matrix is F F^T / pixels, the normalisation of the authors' code; the equation's 1 / (4 N² M²) differs from it
     by a factor per layer. The batch is so many groups of consecutive patches, each of one exemplar: matrices are averaged
-    within a group before they are compared, for a mean is a less noisy target than any one patch. `relative` divides each
-    layer's and group's term by the mean absolute entry of its real matrix: the scale of the features then does not matter.
+    within a group before they are compared. `relative` differences are those over the mean absolute entry of the real
+    matrix: the scale of the features then does not matter. With `energy` all groups are of one exemplar (`gram_energy`).
     """
     terms = []
     for of_real, of_fake in zip(real, fake, strict=True):
-        terms.append(gram_difference(gram_matrices(of_real, groups), gram_matrices(of_fake, groups), relative).mean())
+        wanted, found = (gram_matrices(activations, groups) for activations in (of_real, of_fake))
+        if energy:
+            terms.append(gram_energy(wanted, found, relative))
+        else:
+            terms.append(gram_difference(wanted, found, relative).mean())
     return torch.stack(terms).mean()
+
+
+def gram_energy(wanted: Tensor, found: Tensor, relative: bool) -> Tensor:
+    """How far apart two sets of Gram matrices [G, C, C] are, as distributions: E|W - F| - E|F - F'| / 2.
+
+    Patches of one exemplar are not alike, and a slice is compared with whichever was drawn. |W - F| alone is least where every
+    F is the median of all W: what only some patches show becomes rare. Less half of what slices differ from each other, it is
+    the part of the energy distance (Székely, Rizzo 2013, "Energy statistics") that depends on F, least where F is
+    distributed as W.
+    """
+    between = torch.stack([(wanted - one).abs().mean() for one in found]).mean()
+    pairs = [(found[k] - found[:k]).abs().mean((1, 2)) for k in range(1, len(found))]
+    within = torch.cat(pairs).mean() if pairs else torch.zeros_like(between)
+    energy = between - within / 2
+    return energy / wanted.abs().mean() if relative else energy
 
 
 def gram_difference(wanted: Tensor, found: Tensor, relative: bool) -> Tensor:

@@ -1,10 +1,10 @@
-"""When a training was at its best, and when it no longer gets better, told by a critic that no longer learns.
+"""When a training gets no better, told by a critic that no longer learns.
 
 Neither loss says so: both are measured by a D that moves. The embedded space's critic stands still. Every `EVERY` iterations it
 looks at slices of the moving average, and their mean Gram matrices are compared with those of the exemplar's crops. The
-distance falls as a training gets better, but not steadily: D and S chase each other. The average at the lowest is worth
-keeping; when there was no lower one for half as long as it took to get there, that is a plateau. The paper trains for a
-fixed number of iterations, and keeps the last.
+distance falls as a training gets better, but not steadily: D and S chase each other, and on the way mean Gram matrices pass
+near the exemplar's by chance, whatever the slices look like. So a running mean of it is watched: when that was not lower for
+half as long as it took to get there, it is a plateau. The paper trains for a fixed number of iterations.
 """
 
 from __future__ import annotations
@@ -27,26 +27,29 @@ from solidgrain.train.slices import draw_slices
 
 EVERY = 25  # iterations
 BATCHES = 8  # of slices, the same ones each time
-GAIN = 0.02  # by which a distance must undercut the lowest before it
+MEMORY = 8  # looks, of the running mean
+GAIN = 0.02  # by which it must undercut the lowest before it
 SHARE = 0.5  # of the iterations until the lowest, that may pass without another
 LEAST = 200  # of them in any case
 
 
 @dataclass
 class Plateau:
-    """The lowest distance so far; goes into the checkpoint."""
+    """The running mean of the distance, and the lowest that it was; goes into the checkpoint."""
 
     lowest: float = math.inf
     at: int = 0  # iteration
     looked: int = 0  # the last time
+    mean: float = 0.0
+    seen: int = 0  # looks that follow each other
 
-    def see(self, distance: float, iteration: int) -> bool:
-        """Whether it is the lowest since looks began to follow each other."""
-        lower = self._stale(iteration) or distance < (1 - GAIN) * self.lowest
-        if lower:
-            self.lowest, self.at = distance, iteration
-        self.looked = iteration
-        return lower
+    def see(self, distance: float, iteration: int) -> None:
+        if self._stale(iteration):
+            self.seen, self.lowest = 0, math.inf
+        self.seen, self.looked = self.seen + 1, iteration
+        self.mean += (distance - self.mean) / min(self.seen, MEMORY)
+        if self.mean < (1 - GAIN) * self.lowest:
+            self.lowest, self.at = self.mean, iteration
 
     def reached(self, iteration: int) -> bool:
         waited = math.isfinite(self.lowest) and iteration - self.at >= max(LEAST, SHARE * self.at)

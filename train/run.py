@@ -109,12 +109,6 @@ def read_checkpoint(path: Path, wanted: Collection[str]) -> dict[str, Any]:
     return state
 
 
-def result(state: dict[str, Any]) -> dict[str, Any]:
-    """The weights that a training has come to: the average that was kept as the nearest to the exemplar, else the last one."""
-    weights: dict[str, Any] = state.get("best") or state["average"]  # checkpoints of earlier versions have no "best"
-    return weights
-
-
 @dataclass(frozen=True)
 class Run(RunFolder):
     """The training of a single exemplar."""

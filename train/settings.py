@@ -49,6 +49,7 @@ class Settings:
     pooled_gram: bool = False  # compare the mean Gram matrices of all patches of an exemplar, else patch by patch
 
     relative_gram: bool = False  # differences of Gram matrices over their size, else as they are
+    gram_energy: bool = False  # L_style is an energy distance: slices may differ among themselves as the exemplar's patches do
 
     # Texture space (Sec. 3.2)
     latent: int = 0  # length of z; 0 for a single exemplar
@@ -68,7 +69,6 @@ class Settings:
     sampler_half_life: float = 400.0
     octave_rate: float = 1.0  # of T_i and of the network Q that makes them, over the sampler's
     average_decay: float = 0.999  # at most, of the exponential moving average whose weights are all output
-    keep_best: bool = False  # the result is that average when it was nearest to the exemplar (plateau.py), else the last
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
     # Reporting
@@ -116,12 +116,13 @@ class Budget:
 
 
 FAST = Settings(
+    alpha=0.03,
     critic_contrast=0.15,
     critic_start="stone",
     principal_colors=True,
     relative_gram=True,
+    gram_energy=True,
     octave_rate=0.1,
-    keep_best=True,
 )
 """Tuned for few CPU minutes. How it departs from the paper, and why, is in docs/training.md."""
 
@@ -154,9 +155,10 @@ PRESETS = {
     "fast space": replace(
         FAST,
         **SPACE,
+        alpha=0.1,
         color_moments=True,
         pooled_gram=True,
-        keep_best=False,
+        gram_energy=False,
         sampler_rate=1e-3,
         sampler_half_life=6000.0,
         critic_rate=2e-3,

@@ -30,7 +30,7 @@ from solidgrain.train.cuts import Sample
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
 from solidgrain.train.loop import train
-from solidgrain.train.run import Run, RunFolder, Source, create_run, open_run, result
+from solidgrain.train.run import Run, RunFolder, Source, create_run, open_run
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, flat_slice
 from solidgrain.train.space import Space
@@ -191,7 +191,7 @@ def opened(run: RunFolder, device: torch.device) -> Opened:
     if state is None:
         raise TrainingError(f"{run.folder}: no checkpoint to measure")
     model = make_task(run, device).make_model(torch.Generator(device))
-    model.load_state_dict(result(state))
+    model.load_state_dict(state["average"])
     if isinstance(run, Run):
         settle_mean(model, run.exemplar)  # as an export does
     return Opened(model, state["iteration"], run.settings.octaves, device)

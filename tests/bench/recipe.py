@@ -64,7 +64,8 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "sampler-rate": (
         "constant rates of S", as_paper("sampler_rate", "sampler_rate_floor", "sampler_half_life"),
     ),
-    "keep-best": ("the last average", as_paper("keep_best")),
+    "energy": ("slices compared with the median patch", as_paper("gram_energy")),
+    "alpha": ("alpha 0.1", as_paper("alpha")),
     "patch": ("patches of 128²", as_paper("patch")),
     "batch": ("batches of 16", as_paper("batch")),
     "rotations": ("Euler angles from [0°, 90°]", as_paper("rotations")),

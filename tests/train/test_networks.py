@@ -118,6 +118,20 @@ def test_style_loss_compares_exemplar_by_exemplar():
     torch.testing.assert_close(torch.stack(one_by_one).mean(), together)
 
 
+def test_an_energy_distance_lets_slices_differ_as_the_exemplar_s_patches_do():
+    """Of patches three of which are dark and one is bright, the median is dark: only the energy asks for bright ones."""
+    brightness = torch.tensor([1.0, 1.0, 1.0, 3.0])
+    mixed, dark = (values[:, None, None, None].expand(4, 1, 2, 2).clone() for values in (brightness, torch.ones(4)))
+    plain, energy = ([float(style_loss([mixed], [found], 4, energy=on)) for found in (mixed, dark)] for on in (False, True))
+    assert plain == [0, 2]  # patch by patch, in an order that slices do not know:
+    unordered = [mixed[torch.tensor(order)] for order in ([0, 1, 2, 3], [3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2])]
+    assert np.mean([float(style_loss([mixed], [found], 4)) for found in unordered]) > plain[1]
+    assert [float(style_loss([mixed], [found], 4, energy=True)) for found in unordered] == [energy[0]] * 4
+    # E|W - F| of nine pairs in sixteen that agree, and of sixteen of which four do not, which is less; E|F - F'| is 4 and 0
+    assert energy == [pytest.approx(6 / 16 * 8 - 4 / 2), pytest.approx(4 / 16 * 8)]
+    assert energy[0] < energy[1]
+
+
 def test_gram_matrices_are_averaged_over_the_patches_of_one_exemplar_and_never_over_two():
     assert preset("fast", batch=6).gram_groups == 6
     assert preset("fast", batch=6, pooled_gram=True).gram_groups == 1
