@@ -54,7 +54,7 @@ sanitize: install
 		$(BIN)/python -m pytest tests/runtime/test_kernel.py -k 'not damaged_library and not interrupt and not come_and_go'
 
 bench: install
-	$(BIN)/python -m tests.bench.bench
+	$(BIN)/python -m tests.bench.bench $(FLAGS)
 
 bench-bake: install
 	$(BIN)/python -m tests.bench.bakes --large

@@ -28,7 +28,7 @@ from solidgrain.train.companion import Companion
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
 from solidgrain.train.loop import use_bfloat16
-from solidgrain.train.losses import gram_difference, gram_matrices, mean_grams
+from solidgrain.train.losses import gram_energy, gram_matrices
 from solidgrain.train.noise import draw_tables, look_up
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, draw_slices
@@ -37,6 +37,7 @@ from solidgrain.train.vgg import STYLE_LAYERS, Vgg
 FloatArray = npt.NDArray[np.float32]
 
 ITERATIONS = 300
+REACH, PLACES = 64.0, 1 << 15  # units of 64 pixels within which a mean colour is taken, at so many places
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ class Recipe:
     constant: float = 2 / 3  # share of the budget after which rates begin to fall, to a tenth
     average_decay: float = 0.95  # of the moving average that becomes the texture
     tables_kept: int = 8  # iterations that share noise tables, each with offsets of its own
-    crops: int = 128  # of the photograph, whose mean Gram matrices are aimed at
+    crops: int = 128  # of the photograph, whose Gram matrices are aimed at
+    compared: int = 8  # of them, in an iteration
     measured: int = 8  # batches, of L_style as it is reported
     memory: int = 30  # iterations, of the running mean of L_style
     patience: int = 60  # iterations without a new low of that mean: a plateau
@@ -169,7 +171,8 @@ class Adaptation:
         groups = [{"params": [part], "lr": rate, "start": rate} for part, rate in zip(self.theta, rates, strict=True)]
         self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
         self.stretch = stretch_to(features.contrast, photograph, device)
-        self.target = self._mean_grams(photograph)
+        self.mean_color = torch.from_numpy(photograph.reshape(-1, 3).mean(0, dtype=np.float64)).float().to(device)
+        self.target = self._crop_grams(photograph)
         self.tables = torch.empty(0)
 
     def step(self, pace: float) -> float:
@@ -197,13 +200,17 @@ class Adaptation:
             rgb = self.sampler(noise, theta)
             images = rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
             activations = self.features.activations(self.stretch(images))
+        some = torch.randint(len(self.target[0]), (self.recipe.compared,), generator=generator, device=generator.device)
         pairs = zip(self.target, activations, strict=True)
-        terms = [gram_difference(wanted, gram_matrices(of_layer, 1), self.features.relative) for wanted, of_layer in pairs]
+        terms = [
+            gram_energy(of_crops[some], gram_matrices(of_layer, len(of_layer)), self.features.relative)
+            for of_crops, of_layer in pairs
+        ]
         return torch.stack(terms).mean()
 
     @torch.no_grad()
-    def _mean_grams(self, photograph: FloatArray) -> list[Tensor]:
-        """What L_style compares with: since F is fixed, crops of the photograph need to be looked at only once."""
+    def _crop_grams(self, photograph: FloatArray) -> list[Tensor]:
+        """What L_style compares with, by layer [crops, C, C]: since F is fixed, crops need to be looked at only once."""
         member = Member("", np.round(photograph * LEVELS).astype(np.uint16), wraps(photograph))
         height, width = photograph.shape[:2]
         if min(height, width) < self.settings.patch:
@@ -217,7 +224,11 @@ class Adaptation:
             with self._autocast():
                 return self.features.activations(self.stretch(crops))
 
-        return mean_grams(look() for _ in range(math.ceil(self.recipe.crops / self.settings.batch)))
+        looks = [
+            [gram_matrices(of_layer, len(of_layer)) for of_layer in look()]
+            for _ in range(math.ceil(self.recipe.crops / self.settings.batch))
+        ]
+        return [torch.cat(of_layer) for of_layer in zip(*looks, strict=True)]
 
     @torch.no_grad()
     def measure(self, theta: Theta) -> float:
@@ -225,6 +236,17 @@ class Adaptation:
         generator = torch.Generator(self.generator.device).manual_seed((self.settings.seed + 1) % 2**64)
         tables = draw_tables(self.settings.octaves, self.settings.resolution, generator)
         return float(torch.stack([self._style(theta, tables, generator) for _ in range(self.recipe.measured)]).mean())
+
+    @torch.no_grad()
+    def settled(self, theta: Theta) -> Theta:
+        """The same with the photograph's mean colour, by the last delta: L_style says less exactly what that is."""
+        generator = torch.Generator(self.generator.device).manual_seed((self.settings.seed + 2) % 2**64)
+        tables = draw_tables(self.settings.octaves, self.settings.resolution, generator)
+        points = REACH * torch.rand(1, PLACES, 3, generator=generator, device=generator.device)
+        rgb = self.sampler(look_up(tables, theta.directions * self.octave_scale, points), theta)
+        weight, _ = self.sampler.layers[-1]
+        shift = (self.mean_color - rgb.mean((0, 1))) @ torch.linalg.pinv(weight)
+        return theta._replace(delta=torch.cat([theta.delta[:-1], theta.delta[-1:] + shift]))
 
     def texture(self, theta: Theta) -> TextureData:
         directions, gamma, delta, noise_weights = (part.detach().cpu().numpy() for part in theta)
@@ -327,6 +349,9 @@ def adapt(
         if descent.plateau and share < pace.falls_from:
             pace, ended = Pace(share), "plateau"
         on_report(Report(state.iteration, seconds, descent.mean))
-    found = [(first, unadapted), *((state.measure(theta), theta) for theta in (descent.best, state.average))]
+    found = [
+        (first, unadapted),
+        *((state.measure(theta), theta) for theta in map(state.settled, (descent.best, state.average))),
+    ]
     end, theta = min((pair for pair in found if math.isfinite(pair[0])), key=lambda pair: pair[0])
     return Adapted(state.texture(theta), first, end, state.iteration, time.monotonic() - began, ended)

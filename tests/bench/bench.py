@@ -29,10 +29,12 @@ REPORT = Path("build/bench.json")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="leave out the largest sizes")
-    quick = parser.parse_args().quick
+    parser.add_argument("--rounds", type=int, default=ROUNDS, help=f"of the evaluators, a minute each ({ROUNDS})")
+    arguments = parser.parse_args()
+    quick = arguments.quick
     threads = sorted({1, usable_threads()})
     report: dict[str, Any] = {"threads": threads[-1], "kernel_paths": kernel_paths()}
-    report["rates"] = [row for octaves in (32, 16) for row in rates(octaves, threads)]
+    report["rates"] = [row for octaves in (32, 16) for row in rates(octaves, threads, arguments.rounds)]
     report["start"] = start()
     report["bakes"] = bakes(128 if quick else 256, threads, report["rates"])
     report["memory"] = depth(128 if quick else 256)
@@ -43,14 +45,14 @@ def main() -> None:
     print(f"\n{REPORT} holds all of it.")
 
 
-def rates(octaves: int, threads: list[int]) -> list[dict[str, Any]]:
+def rates(octaves: int, threads: list[int], number: int) -> list[dict[str, Any]]:
     """The table of evaluators, one row per way and thread count."""
     columns = ("way", "threads", "grid", "tiled", "points", "over_torch", "over_graph", "of_gemm", "over_one_thread")
     heading(f"n = {octaves}, Mvoxel/s", *columns[:5], "× torch", "× ONNX graph", "of GEMM", "× one thread")
     rows: list[dict[str, Any]] = []
     alone: dict[str, float] = {}  # by way, with one thread
     for count in threads:
-        rounds = [one_round(octaves, count) for _ in range(ROUNDS)]
+        rounds = [one_round(octaves, count) for _ in range(number)]
         best = {way: {key: max(found[way][key] for found in rounds) for key in rate} for way, rate in rounds[0].items()}
         for way, rate in best.items():
             fast = rate.get("grid", rate["points"])

@@ -109,6 +109,12 @@ def test_colours_come_close_to_the_photograph_s(adapted, space, clouds):
     assert far(adapted.texture) < 0.5 * far(space.encode(clouds).data)
 
 
+def test_the_solid_s_mean_colour_is_the_photograph_s(adapted, space, clouds):
+    """Where no colour is clipped; over the whole solid, of which a slab shows a part."""
+    volume = space.open(adapted.texture).grid((4, 96, 96), spacing=97.0)  # far apart, so that voxels are independent
+    np.testing.assert_allclose(volume.mean((0, 1, 2)), clouds.mean((0, 1)), atol=0.02)
+
+
 def test_only_what_the_texture_owns_changes(space, companion, clouds):
     start, critic = space.encode(clouds, "clouds").data, companion.critic
     sampler = FrozenSampler(space.bundle, start, CPU)
