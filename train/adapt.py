@@ -28,7 +28,7 @@ from solidgrain.train.companion import Companion
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
 from solidgrain.train.loop import use_bfloat16
-from solidgrain.train.losses import gram_energy, gram_matrices
+from solidgrain.train.losses import gram_difference, gram_matrices, mean_grams
 from solidgrain.train.noise import draw_tables, look_up
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, draw_slices
@@ -36,7 +36,7 @@ from solidgrain.train.vgg import STYLE_LAYERS, Vgg
 
 FloatArray = npt.NDArray[np.float32]
 
-ITERATIONS = 300
+ITERATIONS, SECONDS = 600, 120.0  # whichever comes first, where no flag says otherwise
 REACH, PLACES = 64.0, 1 << 15  # units of 64 pixels within which a mean colour is taken, at so many places
 
 
@@ -49,13 +49,12 @@ class Recipe:
     noise_rate: float = 3e-3  # of A_l
     warm_up: int = 10  # iterations until rates are whole: Adam's first steps are as long as its others, in no sure direction
     constant: float = 2 / 3  # share of the budget after which rates begin to fall, to a tenth
-    average_decay: float = 0.95  # of the moving average that becomes the texture
+    average_decay: float = 0.98  # of the moving average that becomes the texture
     tables_kept: int = 8  # iterations that share noise tables, each with offsets of its own
-    crops: int = 128  # of the photograph, whose Gram matrices are aimed at
-    compared: int = 8  # of them, in an iteration
+    crops: int = 128  # of the photograph, whose mean Gram matrices are aimed at
     measured: int = 8  # batches, of L_style as it is reported
     memory: int = 30  # iterations, of the running mean of L_style
-    patience: int = 60  # iterations without a new low of that mean: a plateau
+    patience: int = 150  # iterations without a new low of that mean: a plateau
     gain: float = 0.01  # by which a low must undercut the last one
     limit: float = 10.0  # times its first value that the mean may reach
 
@@ -172,7 +171,7 @@ class Adaptation:
         self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
         self.stretch = stretch_to(features.contrast, photograph, device)
         self.mean_color = torch.from_numpy(photograph.reshape(-1, 3).mean(0, dtype=np.float64)).float().to(device)
-        self.target = self._crop_grams(photograph)
+        self.target = self._mean_grams(photograph)
         self.tables = torch.empty(0)
 
     def step(self, pace: float) -> float:
@@ -200,17 +199,13 @@ class Adaptation:
             rgb = self.sampler(noise, theta)
             images = rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
             activations = self.features.activations(self.stretch(images))
-        some = torch.randint(len(self.target[0]), (self.recipe.compared,), generator=generator, device=generator.device)
         pairs = zip(self.target, activations, strict=True)
-        terms = [
-            gram_energy(of_crops[some], gram_matrices(of_layer, len(of_layer)), self.features.relative)
-            for of_crops, of_layer in pairs
-        ]
+        terms = [gram_difference(wanted, gram_matrices(of_layer, 1), self.features.relative) for wanted, of_layer in pairs]
         return torch.stack(terms).mean()
 
     @torch.no_grad()
-    def _crop_grams(self, photograph: FloatArray) -> list[Tensor]:
-        """What L_style compares with, by layer [crops, C, C]: since F is fixed, crops need to be looked at only once."""
+    def _mean_grams(self, photograph: FloatArray) -> list[Tensor]:
+        """What L_style compares with: since F is fixed, crops of the photograph need to be looked at only once."""
         member = Member("", np.round(photograph * LEVELS).astype(np.uint16), wraps(photograph))
         height, width = photograph.shape[:2]
         if min(height, width) < self.settings.patch:
@@ -224,11 +219,7 @@ class Adaptation:
             with self._autocast():
                 return self.features.activations(self.stretch(crops))
 
-        looks = [
-            [gram_matrices(of_layer, len(of_layer)) for of_layer in look()]
-            for _ in range(math.ceil(self.recipe.crops / self.settings.batch))
-        ]
-        return [torch.cat(of_layer) for of_layer in zip(*looks, strict=True)]
+        return mean_grams(look() for _ in range(math.ceil(self.recipe.crops / self.settings.batch)))
 
     @torch.no_grad()
     def measure(self, theta: Theta) -> float:

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--bundle", default=DEFAULT_SPACE, metavar="SPACE", help=f"embedded name or bundle of the space ({DEFAULT_SPACE})")
     add("--critic", type=Path, metavar="FILE", help="the space's critic, from export --companion (critic.npz in the bundle)")
     add("--features", choices=("critic", "vgg"), default="critic", help="what compares slices with the photograph (critic)")
-    add("--iterations", type=parse_positive, metavar="N", help="at most (300, or as many as --seconds allow)")
+    add("--iterations", type=parse_positive, metavar="N", help="at most (600 within 120 s, or as many as --seconds allow)")
     add("--seconds", type=parse_seconds, metavar="S", help="at most; the result then depends on the machine's speed")
     add_cut(parser.add_argument_group("the photograph"))
     add("--seed", type=parse_seed, default=0, metavar="N", help="of all randomness (0)")
@@ -94,11 +94,13 @@ def check_flags(arguments: argparse.Namespace) -> None:
 
 
 def make_budget(arguments: argparse.Namespace) -> Budget:
-    from solidgrain.train.adapt import ITERATIONS
+    from solidgrain.train.adapt import ITERATIONS, SECONDS
     from solidgrain.train.settings import Budget
 
+    if arguments.iterations is None and arguments.seconds is None:
+        return Budget(ITERATIONS, SECONDS / 60)
     if arguments.seconds is None:
-        return Budget(arguments.iterations or ITERATIONS)
+        return Budget(arguments.iterations)
     return Budget(arguments.iterations, arguments.seconds / 60)
 
 
