@@ -24,6 +24,7 @@ from solidgrain.runtime.errors import BundleError, ExemplarError, TrainingError
 from solidgrain.runtime.fold import read_weights
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.collection import LEVELS, Member, draw_patches, wraps
+from solidgrain.train.colors import PLACES, REACH
 from solidgrain.train.companion import Companion
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
@@ -37,7 +38,6 @@ from solidgrain.train.vgg import STYLE_LAYERS, Vgg
 FloatArray = npt.NDArray[np.float32]
 
 ITERATIONS, SECONDS = 600, 120.0  # whichever comes first, where no flag says otherwise
-REACH, PLACES = 64.0, 1 << 15  # units of 64 pixels within which a mean colour is taken, at so many places
 
 
 @dataclass(frozen=True)
@@ -316,14 +316,15 @@ def adapt(
     """Adapt a texture to a photograph [H, W, 3] until the budget is spent, L_style stops falling, or `should_stop` says so.
 
     The texture is the moving average of theta, or, if that has the lower L_style, the average at the lowest running mean: so
-    an adaptation that diverges ends with the best that it had. It is never worse by L_style than `start`, which may be what
-    comes back. Raises TrainingError if L_style of that is not a number.
+    an adaptation that diverges ends with the best that it had. Either gets the photograph's mean colour. It is never worse by
+    L_style than `start`, which may be what comes back. Raises TrainingError if L_style of that is not a number.
     """
     began = time.monotonic()
     state = Adaptation(start, sampler, photograph, features, settings, recipe, device)
     descent, pace, ended, share = Descent(recipe, state.average.copy()), Pace(recipe.constant), "budget", 0.0
     unadapted, measuring = state.average.copy(), time.monotonic()
     first = state.measure(unadapted)
+    state.settled(unadapted)  # for the time that it takes
     reserved = 2 * (time.monotonic() - measuring)  # for the two thetas that are measured at the end
     if not math.isfinite(first):
         raise TrainingError(f"texture {start.name!r}: its L_style is not a number; the critic or the bundle is damaged")

@@ -40,8 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--bundle", default=DEFAULT_SPACE, metavar="SPACE", help=f"embedded name or bundle of the space ({DEFAULT_SPACE})")
     add("--critic", type=Path, metavar="FILE", help="the space's critic, from export --companion (critic.npz in the bundle)")
     add("--features", choices=("critic", "vgg"), default="critic", help="what compares slices with the photograph (critic)")
-    add("--iterations", type=parse_positive, metavar="N", help="at most (600 within 120 s, or as many as --seconds allow)")
-    add("--seconds", type=parse_seconds, metavar="S", help="at most; the result then depends on the machine's speed")
+    add(
+        "--iterations",
+        type=parse_positive,
+        metavar="N",
+        help="at most (600, or as many as --seconds allow); alone, there is no limit of time",
+    )
+    add("--seconds", type=parse_seconds, metavar="S", help="at most (120); the result then depends on the machine's speed")
     add_cut(parser.add_argument_group("the photograph"))
     add("--seed", type=parse_seed, default=0, metavar="N", help="of all randomness (0)")
     add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute (auto)")

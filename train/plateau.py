@@ -44,7 +44,7 @@ class Plateau:
     seen: int = 0  # looks that follow each other
 
     def see(self, distance: float, iteration: int) -> None:
-        if self._stale(iteration):
+        if not self.seen or self._stale(iteration):
             self.seen, self.lowest = 0, math.inf
         self.seen, self.looked = self.seen + 1, iteration
         self.mean += (distance - self.mean) / min(self.seen, MEMORY)

@@ -46,10 +46,9 @@ class Settings:
     penalty: float = 10.0  # lambda, weight of the gradient penalty
     penalty_every: int = 4  # iterations between penalties, each weighted that much more (lazy regularisation, StyleGAN2)
     drift: float = 0.001  # weight of E[D(r)^2] (gramgan/main.py; not in the paper)
-    pooled_gram: bool = False  # compare the mean Gram matrices of all patches of an exemplar, else patch by patch
-
+    pooled_gram: bool = False  # compare the mean Gram matrix of all patches of an exemplar, else one of each patch
     relative_gram: bool = False  # differences of Gram matrices over their size, else as they are
-    gram_energy: bool = False  # L_style is an energy distance: slices may differ among themselves as the exemplar's patches do
+    gram_energy: bool = False  # L_style is an energy distance: slices differ among themselves as the exemplar's patches do
 
     # Texture space (Sec. 3.2)
     latent: int = 0  # length of z; 0 for a single exemplar
@@ -166,6 +165,7 @@ PRESETS = {
     ),
     "paper space": replace(PAPER, **SPACE, octave_span=15.5),  # 2^(i/2)
 }
+RETIRED = {"keep_best"}  # settings of earlier versions that decided nothing about the weights
 PRESET_ITERATIONS = {"fast": 2000, "paper": 100_000, "fast space": 30_000, "paper space": 300_000}
 
 
@@ -185,6 +185,7 @@ def to_json(settings: Settings) -> dict[str, Any]:
 
 def from_json(values: dict[str, Any]) -> Settings:
     """Settings back from `options.json`. Raises TrainingError if it names a setting that does not exist."""
+    values = {name: value for name, value in values.items() if name not in RETIRED}
     unknown = set(values) - {field.name for field in fields(Settings)}
     if unknown:
         raise TrainingError(f"options.json: unknown settings {json.dumps(sorted(unknown))}; written by another version?")

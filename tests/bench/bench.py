@@ -14,6 +14,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from solidgrain.bake.arguments import parse_positive
 from solidgrain.runtime import embedded_names
 from solidgrain.runtime.kernel import BFLOAT16_PATHS, kernel_paths
 from solidgrain.runtime.provider import usable_threads
@@ -29,7 +30,7 @@ REPORT = Path("build/bench.json")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="leave out the largest sizes")
-    parser.add_argument("--rounds", type=int, default=ROUNDS, help=f"of the evaluators, a minute each ({ROUNDS})")
+    parser.add_argument("--rounds", type=parse_positive, default=ROUNDS, help=f"of the evaluators, a minute each ({ROUNDS})")
     arguments = parser.parse_args()
     quick = arguments.quick
     threads = sorted({1, usable_threads()})
@@ -45,14 +46,14 @@ def main() -> None:
     print(f"\n{REPORT} holds all of it.")
 
 
-def rates(octaves: int, threads: list[int], number: int) -> list[dict[str, Any]]:
+def rates(octaves: int, threads: list[int], repeats: int) -> list[dict[str, Any]]:
     """The table of evaluators, one row per way and thread count."""
     columns = ("way", "threads", "grid", "tiled", "points", "over_torch", "over_graph", "of_gemm", "over_one_thread")
     heading(f"n = {octaves}, Mvoxel/s", *columns[:5], "× torch", "× ONNX graph", "of GEMM", "× one thread")
     rows: list[dict[str, Any]] = []
     alone: dict[str, float] = {}  # by way, with one thread
     for count in threads:
-        rounds = [one_round(octaves, count) for _ in range(number)]
+        rounds = [one_round(octaves, count) for _ in range(repeats)]
         best = {way: {key: max(found[way][key] for found in rounds) for key in rate} for way, rate in rounds[0].items()}
         for way, rate in best.items():
             fast = rate.get("grid", rate["points"])

@@ -64,7 +64,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "sampler-rate": (
         "constant rates of S", as_paper("sampler_rate", "sampler_rate_floor", "sampler_half_life"),
     ),
-    "energy": ("slices compared with the median patch", as_paper("gram_energy")),
+    "energy": ("slices compared patch by patch", as_paper("gram_energy")),
     "alpha": ("alpha 0.1", as_paper("alpha")),
     "patch": ("patches of 128²", as_paper("patch")),
     "batch": ("batches of 16", as_paper("batch")),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,6 +29,7 @@ from solidgrain.train.adapt import (
     critic_features,
     vgg_features,
 )
+from solidgrain.train.adapt_command import make_budget
 from solidgrain.train.companion import read_companion
 from solidgrain.train.console import StopRequest
 from solidgrain.train.loop import Trainer
@@ -113,6 +115,30 @@ def test_the_solid_s_mean_colour_is_the_photograph_s(adapted, space, clouds):
     """Where no colour is clipped; over the whole solid, of which a slab shows a part."""
     volume = space.open(adapted.texture).grid((4, 96, 96), spacing=97.0)  # far apart, so that voxels are independent
     np.testing.assert_allclose(volume.mean((0, 1, 2)), clouds.mean((0, 1)), atol=0.02)
+
+
+def test_settling_the_mean_colour_moves_the_last_delta_and_nothing_else(space, companion, clouds):
+    start = space.encode(clouds, "clouds").data
+    settings = replace(companion.settings, patch=32, batch=2, precision="float32")
+    state = Adaptation(
+        start, FrozenSampler(space.bundle, start, CPU), clouds, critic_features(companion, CPU), settings, RECIPE, CPU
+    )
+    settled = state.settled(state.average)
+    assert torch.equal(settled.delta[:-1], state.average.delta[:-1])
+    assert not torch.equal(settled.delta[-1], state.average.delta[-1])
+    assert all(
+        torch.equal(getattr(settled, name), getattr(state.average, name)) for name in ("directions", "gamma", "noise_weights")
+    )
+    torch.testing.assert_close(state.settled(settled).delta, settled.delta, atol=1e-4, rtol=0)
+
+
+def test_a_budget_is_two_minutes_unless_told_otherwise():
+    def budget(**given):
+        return make_budget(Namespace(**{"iterations": None, "seconds": None, **given}))
+
+    assert budget() == Budget(600, 2.0)
+    assert budget(iterations=900) == Budget(900)
+    assert budget(seconds=30.0) == Budget(None, 0.5)
 
 
 def test_only_what_the_texture_owns_changes(space, companion, clouds):

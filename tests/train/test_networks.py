@@ -127,9 +127,17 @@ def test_an_energy_distance_lets_slices_differ_as_the_exemplar_s_patches_do():
     unordered = [mixed[torch.tensor(order)] for order in ([0, 1, 2, 3], [3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2])]
     assert np.mean([float(style_loss([mixed], [found], 4)) for found in unordered]) > plain[1]
     assert [float(style_loss([mixed], [found], 4, energy=True)) for found in unordered] == [energy[0]] * 4
-    # E|W - F| of nine pairs in sixteen that agree, and of sixteen of which four do not, which is less; E|F - F'| is 4 and 0
+    # Gram entries are 1 and 9: of 16 pairs (W, F) 6 differ, and 3 of 6 pairs (F, F'); of dark slices 4 of 16, and none
     assert energy == [pytest.approx(6 / 16 * 8 - 4 / 2), pytest.approx(4 / 16 * 8)]
     assert energy[0] < energy[1]
+
+
+def test_an_energy_distance_of_one_patch_is_the_difference_and_may_be_relative():
+    real, fake = torch.randn(2, 1, 5, 8, 8, generator=generator())
+    torch.testing.assert_close(style_loss([real], [fake], 1, energy=True), style_loss([real], [fake], 1))
+    real, fake = torch.randn(2, 3, 5, 8, 8, generator=generator())
+    relative = style_loss([real], [fake], 3, relative=True, energy=True)
+    torch.testing.assert_close(style_loss([9 * real], [9 * fake], 3, relative=True, energy=True), relative)
 
 
 def test_gram_matrices_are_averaged_over_the_patches_of_one_exemplar_and_never_over_two():
