@@ -5,7 +5,7 @@ python -m tests.bench.paper_table --minutes 20 --threads 1 --out FOLDER [--resum
 Prints distances to the exemplar over its own floor (`solidgrain.train.quality`; the paper's measure, SIFID, needs --inception),
 mean ± deviation over one randomly oriented slice of each of 50 instances, beside the paper's figures, and how far the orders
 of the methods agree. All columns but the last start from the `fast` preset with the paper's losses, since its other settings
-want a GPU for hours; the last one has them all. FOLDER gets table.md, table.json, a strip of slices per exemplar, and every run.
+want a GPU for hours; the last has them all. FOLDER gets table.md, table.json, a strip of slices per exemplar, and every run.
 """
 
 from __future__ import annotations

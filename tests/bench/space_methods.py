@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -50,12 +50,13 @@ class Methods:
     budget: tuple[str, str] | None  # of adapting, as its command takes it; None if there is none
     critic: Path | None  # of adapting, where the bundle does not hold it
     henzler: Other | None
+    features: Sequence[str] = ADAPTED  # of L_style, of the columns that are adapted
 
     @property
     def passes(self) -> list[list[str]]:
         """The columns, those first that take the least time."""
         first = ["truth", "unadapted"] if self.henzler is None else ["truth", "unadapted", "henzler"]
-        return [first] if self.budget is None else [first, *([column] for column in ADAPTED)]
+        return [first] if self.budget is None else [first, *([column] for column in self.features)]
 
     def sample(self, column: str, patch: FloatArray, folder: Path) -> Sample:
         """A column's texture of the patch that lies in the folder as `exemplar.png`, adapted unless it was before."""

@@ -100,6 +100,7 @@ def parser() -> argparse.ArgumentParser:
     add("--seconds", type=parse_seconds, default=60.0, metavar="S", help="of adapting, with D and with VGG (60)")
     add("--iterations", type=parse_positive, metavar="N", help="of adapting, in the place of --seconds")
     add("--only-unadapted", action="store_true", help="leave the adapted columns for another time")
+    add("--without-vgg", action="store_true", help="leave out what is adapted with VGG's features")
     add("--critic", type=Path, metavar="FILE", help="what adapting with D needs, where the bundle does not hold it")
     add("--henzler", type=Path, metavar="FOLDER", help="a space after Henzler et al., bundle or run, for a column of its own")
     add("--exemplars", type=Path, default=cells.EXEMPLARS, metavar="FOLDER", help=f"holds the photographs ({cells.EXEMPLARS})")
@@ -165,7 +166,8 @@ def methods_of(space: Space, arguments: argparse.Namespace) -> Methods:
     if henzler and (seen := set(space.bundle.manifest["training"]["held_out"]) - henzler.held_out):
         raise UsageError(f"--henzler {arguments.henzler}: was trained on {min(seen)}; --hold-out the same photographs")
     budget = None if arguments.only_unadapted else budget_of(arguments)
-    return Methods(space, arguments.threads, budget, arguments.critic, henzler)
+    features = ADAPTED[:1] if arguments.without_vgg else ADAPTED
+    return Methods(space, arguments.threads, budget, arguments.critic, henzler, features)
 
 
 def budget_of(arguments: argparse.Namespace) -> tuple[str, str]:

@@ -135,6 +135,11 @@ def test_a_table_grows_by_what_is_asked_and_nothing_is_made_twice(flags, adapted
     assert (shape.height, shape.width) == (PATCH, 9 * PATCH + 8 * 8)
 
 
+def test_the_column_of_vgg_may_be_left_out(flags, adapted):
+    space_table.main([*flags, "--seconds", "5", "--without-vgg", "--only", "granite.png"])
+    assert adapted == [("granite.png", "critic", ("--seconds", "5"))]
+
+
 def test_large_photographs_are_scaled_and_what_is_measured_is_the_runtime_s_texture_of_their_middle(
     flags, bundle, photographs, tmp_path
 ):
