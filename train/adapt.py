@@ -24,7 +24,6 @@ from solidgrain.runtime.errors import BundleError, ExemplarError, TrainingError
 from solidgrain.runtime.fold import read_weights
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.collection import LEVELS, Member, draw_patches, wraps
-from solidgrain.train.colors import PLACES, REACH
 from solidgrain.train.companion import Companion
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
@@ -115,15 +114,26 @@ class FrozenSampler:
         self.layers = list(zip(rest[::2], rest[1::2], strict=True))  # W_l [m, m] for x W, b_l [m]
 
     def __call__(self, noise: Tensor, theta: Theta) -> Tensor:
-        """noise [B, P, n] -> colour [B, P, 3], not clipped: Eq. 5, gamma and delta folded into the layer that follows."""
+        """noise [B, P, n] -> colour [B, P, 3], not clipped: Eq. 5, gamma and delta folded into the layer that follows.
+
+        The last layer is float32 in any case: in bfloat16 a bright colour has steps of 1/256, as large as a faint material's
+        contrast.
+        """
         bins = noise.chunk(len(theta.noise_weights), dim=-1)  # (B, P, n / 4) each
         y = self.first + bins[0] @ theta.noise_weights[0]
-        for layer, (weight, bias) in enumerate(self.layers):
-            folded, shifted = theta.gamma[layer, :, None] * weight, theta.delta[layer] @ weight + bias
-            y = F.linear(activate(y), folded.T, shifted)  # W (gamma phi(y) + delta) + b
+        for layer in range(len(self.layers) - 1):
+            y = F.linear(activate(y), *self._folded(layer, theta))
             if layer + 1 < len(bins):
                 y = y + bins[layer + 1] @ theta.noise_weights[layer + 1]
-        return y
+        with torch.autocast(y.device.type, enabled=False):
+            weight, bias = self._folded(-1, theta)
+            return F.linear(activate(y).to(weight), weight, bias)
+
+    def _folded(self, layer: int, theta: Theta) -> tuple[Tensor, Tensor]:
+        """W' and b' of W (gamma x + delta) + b = W' x + b', float32 or wider."""
+        weight, bias = self.layers[layer]
+        with torch.autocast(weight.device.type, enabled=False):
+            return (theta.gamma[layer, :, None] * weight).T, theta.delta[layer] @ weight + bias
 
 
 def critic_features(companion: Companion, device: torch.device) -> Features:
@@ -170,7 +180,6 @@ class Adaptation:
         groups = [{"params": [part], "lr": rate, "start": rate} for part, rate in zip(self.theta, rates, strict=True)]
         self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
         self.stretch = stretch_to(features.contrast, photograph, device)
-        self.mean_color = torch.from_numpy(photograph.reshape(-1, 3).mean(0, dtype=np.float64)).float().to(device)
         self.target = self._mean_grams(photograph)
         self.tables = torch.empty(0)
 
@@ -227,17 +236,6 @@ class Adaptation:
         generator = torch.Generator(self.generator.device).manual_seed((self.settings.seed + 1) % 2**64)
         tables = draw_tables(self.settings.octaves, self.settings.resolution, generator)
         return float(torch.stack([self._style(theta, tables, generator) for _ in range(self.recipe.measured)]).mean())
-
-    @torch.no_grad()
-    def settled(self, theta: Theta) -> Theta:
-        """The same with the photograph's mean colour, by the last delta: L_style says less exactly what that is."""
-        generator = torch.Generator(self.generator.device).manual_seed((self.settings.seed + 2) % 2**64)
-        tables = draw_tables(self.settings.octaves, self.settings.resolution, generator)
-        points = REACH * torch.rand(1, PLACES, 3, generator=generator, device=generator.device)
-        rgb = self.sampler(look_up(tables, theta.directions * self.octave_scale, points), theta)
-        weight, _ = self.sampler.layers[-1]
-        shift = (self.mean_color - rgb.mean((0, 1))) @ torch.linalg.pinv(weight)
-        return theta._replace(delta=torch.cat([theta.delta[:-1], theta.delta[-1:] + shift]))
 
     def texture(self, theta: Theta) -> TextureData:
         directions, gamma, delta, noise_weights = (part.detach().cpu().numpy() for part in theta)
@@ -316,15 +314,14 @@ def adapt(
     """Adapt a texture to a photograph [H, W, 3] until the budget is spent, L_style stops falling, or `should_stop` says so.
 
     The texture is the moving average of theta, or, if that has the lower L_style, the average at the lowest running mean: so
-    an adaptation that diverges ends with the best that it had. Either gets the photograph's mean colour. It is never worse by
-    L_style than `start`, which may be what comes back. Raises TrainingError if L_style of that is not a number.
+    an adaptation that diverges ends with the best that it had. It is never worse by L_style than `start`, which may be what
+    comes back. Raises TrainingError if L_style of that is not a number.
     """
     began = time.monotonic()
     state = Adaptation(start, sampler, photograph, features, settings, recipe, device)
     descent, pace, ended, share = Descent(recipe, state.average.copy()), Pace(recipe.constant), "budget", 0.0
     unadapted, measuring = state.average.copy(), time.monotonic()
     first = state.measure(unadapted)
-    state.settled(unadapted)  # for the time that it takes
     reserved = 2 * (time.monotonic() - measuring)  # for the two thetas that are measured at the end
     if not math.isfinite(first):
         raise TrainingError(f"texture {start.name!r}: its L_style is not a number; the critic or the bundle is damaged")
@@ -341,9 +338,6 @@ def adapt(
         if descent.plateau and share < pace.falls_from:
             pace, ended = Pace(share), "plateau"
         on_report(Report(state.iteration, seconds, descent.mean))
-    found = [
-        (first, unadapted),
-        *((state.measure(theta), theta) for theta in map(state.settled, (descent.best, state.average))),
-    ]
+    found = [(first, unadapted), *((state.measure(theta), theta) for theta in (descent.best, state.average))]
     end, theta = min((pair for pair in found if math.isfinite(pair[0])), key=lambda pair: pair[0])
     return Adapted(state.texture(theta), first, end, state.iteration, time.monotonic() - began, ended)
