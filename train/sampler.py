@@ -66,10 +66,15 @@ class Octaves(nn.Module):
         self.color_mean = mean.float()
         self.color_axes = (deviations[:, None] * axes.T).float()
 
-    def colored(self, output: Tensor) -> Tensor:
-        """The last layer's output [..., 3] as rgb."""
-        exact = output if output.dtype == torch.float64 else output.float()
-        return self.color_mean.to(exact) + (exact[..., None] * self.color_axes.to(exact)).sum(-2)  # a product would be autocast
+    def colored(self, output: Linear, x: Tensor) -> Tensor:
+        """The last hidden layer's activations [..., m] as rgb, through the output layer and along the colours' axes.
+
+        Float32 or wider: in bfloat16 a bright colour has steps of 1/256, as large as a faint material's contrast.
+        """
+        exact = x if x.dtype == torch.float64 else x.float()
+        with torch.autocast(exact.device.type, enabled=False):
+            rgb: Tensor = self.color_mean.to(exact) + output(exact) @ self.color_axes.to(exact)
+        return rgb
 
     def noise(self, tables: Tensor, points: Tensor, transforms: Tensor | None = None) -> Tensor:
         """eta(c): tables [n, R, R, R], points [B, P, 3] -> [B, P, n], through `transforms` in place of its own if given."""
@@ -104,7 +109,7 @@ class Sampler(Octaves):
             x = activate(y)
             if condition is not None:
                 x = condition.styled(layer, x)
-        return self.colored(self.output(x))
+        return self.colored(self.output, x)
 
 
 class NoiseAtInputSampler(Octaves):
@@ -123,7 +128,7 @@ class NoiseAtInputSampler(Octaves):
             x = activate(dense(x))
             if condition is not None:
                 x = condition.styled(layer, x)
-        return self.colored(self.output(x))
+        return self.colored(self.output, x)
 
 
 def make_sampler(settings: Settings, generator: torch.Generator) -> Sampler | NoiseAtInputSampler:

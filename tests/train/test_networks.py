@@ -147,6 +147,18 @@ def test_gram_matrices_are_averaged_over_the_patches_of_one_exemplar_and_never_o
     assert preset("paper", batch=6).gram_groups == preset("paper space", batch=6).gram_groups == 6
 
 
+def test_colours_are_float32_where_hidden_layers_are_not():
+    """A bright colour in bfloat16 has steps of 1/256, as large as a faint material's contrast."""
+    sampler = Sampler(preset("fast", octaves=8), generator())
+    sampler.take_colors(torch.full((3,), 0.9), 1e-6 * torch.eye(3))
+    tables, points = torch.randn(8, 64, 64, 64, generator=generator()), torch.rand(1, 99, 3, generator=generator())
+    with torch.autocast("cpu", torch.bfloat16), torch.no_grad():
+        rgb = sampler(tables, points)
+    assert rgb.dtype == torch.float32
+    assert not torch.equal(rgb, rgb.bfloat16().float())
+    torch.testing.assert_close(rgb, sampler(tables, points).detach(), atol=1e-4, rtol=0)
+
+
 def test_what_the_latent_code_says_of_a_texture_is_float32_where_other_layers_are_not():
     """An octave's T_i in bfloat16 would be off by whole texels."""
     space = Space(preset("fast space", octaves=8), generator())
