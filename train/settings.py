@@ -165,7 +165,7 @@ PRESETS = {
     ),
     "paper space": replace(PAPER, **SPACE, octave_span=15.5),  # 2^(i/2)
 }
-RETIRED = {"keep_best"}  # settings of earlier versions that decided nothing about the weights
+RETIRED = {"keep_best"}  # settings of earlier versions: the result is the last average now
 PRESET_ITERATIONS = {"fast": 2000, "paper": 100_000, "fast space": 30_000, "paper space": 300_000}
 
 
