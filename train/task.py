@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from solidgrain.train import collection, exemplar
 from solidgrain.train.collection import Member
 from solidgrain.train.contrast import Stretch, stretch_to, together, unstretched
-from solidgrain.train.noise import draw_tables
+from solidgrain.train.noise import draw_tables, shift_tables
 from solidgrain.train.run import Run, RunFolder
 from solidgrain.train.sampler import make_sampler
 from solidgrain.train.settings import Settings
@@ -59,6 +59,22 @@ def make_task(run: RunFolder, device: torch.device) -> Task:
     return SingleExemplar(run, device)
 
 
+class Noise:
+    """Where a batch's noise instance comes from; its slices share one."""
+
+    def __init__(self, settings: Settings, device: torch.device) -> None:
+        self.settings, self.shared = settings, torch.empty(0)
+        if settings.shared_noise:
+            self.shared = self._fresh(torch.Generator(device).manual_seed((settings.seed + 1) % 2**64))
+
+    def draw(self, generator: torch.Generator) -> Tensor:
+        """Tables [n, R, R, R]."""
+        return shift_tables(self.shared, generator) if self.settings.shared_noise else self._fresh(generator)
+
+    def _fresh(self, generator: torch.Generator) -> Tensor:
+        return draw_tables(self.settings.octaves, self.settings.resolution, generator)
+
+
 class SingleExemplar:
     """Sec. 3.1."""
 
@@ -66,6 +82,7 @@ class SingleExemplar:
         self.settings, self.device = run.settings, device
         self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
         self.stretch = stretch_to(run.settings.critic_contrast, run.exemplar, device)
+        self.noise = Noise(run.settings, device)
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
         sampler = make_sampler(self.settings, generator)
@@ -75,7 +92,7 @@ class SingleExemplar:
         return sampler
 
     def draw(self, generator: torch.Generator) -> Batch:
-        inputs = draw_noise(self.settings, generator), draw_slices(self.settings, generator)
+        inputs = self.noise.draw(generator), draw_slices(self.settings, generator)
         return Batch(inputs, exemplar.draw_patches(self.exemplar, self.settings, generator), self.stretch)
 
     def probe(self) -> Probe:
@@ -95,6 +112,7 @@ class TextureSpace:
         self.stretches = [
             stretch_to(contrast, one.exemplar, device) if contrast else unstretched(device) for one in self.members
         ]
+        self.noise = Noise(run.settings, device)
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
         space = Space(self.settings, generator)
@@ -105,7 +123,7 @@ class TextureSpace:
 
     def draw(self, generator: torch.Generator) -> Batch:
         settings, device = self.settings, self.device
-        tables, points = draw_noise(settings, generator), draw_slices(settings, generator)
+        tables, points = self.noise.draw(generator), draw_slices(settings, generator)
         order = torch.randperm(len(self.members), generator=generator, device=device).tolist()
         places = [order[k % len(order)] for k in range(settings.batch // settings.group)]
         chosen = [self.members[place] for place in places]
@@ -133,13 +151,8 @@ def _spread(members: Sequence[Member], count: int) -> list[Member]:
     return [members[k * len(members) // count] for k in range(count)]
 
 
-def draw_noise(settings: Settings, generator: torch.Generator) -> Tensor:
-    """One fresh noise instance, shared by the batch."""
-    return draw_tables(settings.octaves, settings.resolution, generator)
-
-
 def _probe_inputs(settings: Settings, images: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """One instance at far-apart places, which are as independent as instances."""
     generator = torch.Generator(device).manual_seed(7)
-    tables = draw_noise(settings, generator)
+    tables = draw_tables(settings.octaves, settings.resolution, generator)
     return tables, 64 * torch.rand(images, PLACES, 3, generator=generator, device=device)

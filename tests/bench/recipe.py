@@ -58,6 +58,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "pooled": ("Gram matrices of the batch's mean", replace(FAST, pooled_gram=True)),
     "octave-rate": ("T_i as fast as the rest", as_paper("octave_rate")),
     "octave-span": ("octaves 2^i", as_paper("octave_span")),
+    "fresh-noise": ("fresh noise tables", as_paper("shared_noise")),
     "orthogonal": ("T_i from N(0,1)", as_paper("orthogonal_start")),
     "noise-weight": ("A from N(0,1)", as_paper("noise_weight_start")),
     "critic-rate": ("D learns twice as fast", as_paper("critic_rate", "critic_rate_floor")),

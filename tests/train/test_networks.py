@@ -9,11 +9,12 @@ import torch.nn.functional as F
 
 from solidgrain.train.critic import Critic
 from solidgrain.train.losses import gradient_penalty, gram_matrices, style_loss
-from solidgrain.train.noise import look_up
+from solidgrain.train.noise import draw_tables, look_up, shift_tables
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import FAST, PAPER, preset, rate
 from solidgrain.train.slices import about_axis, draw_rotations, draw_slices, flat_slice
 from solidgrain.train.space import Space
+from solidgrain.train.task import Noise
 from tests.reference import locate, noise
 
 
@@ -55,6 +56,24 @@ def test_noise_lookup_stays_in_float32_under_autocast():
         reduced = look_up(tables, transforms, points)
     assert reduced.dtype == torch.float32
     assert torch.equal(reduced, look_up(tables, transforms, points))
+
+
+def test_a_shifted_table_holds_the_same_noise_elsewhere():
+    tables, points = draw_tables(3, 16, generator()), 40 * torch.rand(1, 50, 3, generator=generator())
+    random = generator()
+    shifts = torch.randint(16, (3, 3), generator=generator()).float()
+    moved, turned = shift_tables(tables, random), Sampler(preset("fast", octaves=4), generator()).directions[:3].detach()
+    expected = look_up(tables, turned, points, offsets=-shifts)
+    assert torch.allclose(look_up(moved, turned, points), expected, atol=1e-4)
+    assert not torch.equal(shift_tables(tables, random), moved)
+
+
+def test_shared_noise_is_another_instance_in_each_batch_and_no_other_numbers():
+    for shared in (True, False):
+        noise, random = Noise(preset("fast", shared_noise=shared), torch.device("cpu")), generator()
+        first, second = noise.draw(random), noise.draw(random)
+        assert not torch.equal(first, second)
+        assert torch.equal(first[3].flatten().sort()[0], second[3].flatten().sort()[0]) == shared
 
 
 def test_each_octave_enters_one_hidden_layer_and_the_last_layer_gets_none():
