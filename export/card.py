@@ -20,8 +20,8 @@ def write_card(name: str, training: dict[str, Any]) -> str:
         ("minutes", f"{training['minutes']:g}"),
         ("trained by", f"solidgrain {training['revision']}"),
     ]
-    if settings.get("warm_start"):
-        rows.insert(4, ("began as", f"`{settings['warm_start']}`, whose iterations are not counted here"))
+    if start := settings.get("warm_start") or settings.get("sampler_start"):
+        rows.insert(4, ("began as", f"`{start}`, whose iterations are not counted here"))
     exemplars = (
         _grouped(training["exemplars"])
         if len(training["exemplars"]) > MANY

@@ -60,6 +60,7 @@ class Settings:
     # Optimisation
     critic_contrast: float = 0.0  # root mean square to which D sees faint exemplars stretched; 0: as they are
     critic_start: str = ""  # the embedded space whose critic D starts as, else N(0,1)
+    sampler_start: str = ""  # the embedded texture whose octaves and hidden layers S starts with, else random ones
     warm_start: str = ""  # the run or checkpoint file whose weights were taken over instead, for the record
     critic_rate: float = 1e-3
     critic_rate_floor: float = 1e-3
@@ -119,6 +120,7 @@ FAST = Settings(
     alpha=0.03,
     critic_contrast=0.15,
     critic_start="stone",
+    sampler_start="granite",
     principal_colors=True,
     shared_noise=True,
     relative_gram=True,
@@ -157,6 +159,7 @@ PRESETS = {
         FAST,
         **SPACE,
         alpha=0.1,
+        sampler_start="",
         color_moments=True,
         pooled_gram=True,
         gram_energy=False,

@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from solidgrain.train import collection, exemplar
 from solidgrain.train.collection import Member
 from solidgrain.train.contrast import Stretch, stretch_to, together, unstretched
+from solidgrain.train.first_sampler import begin_as
 from solidgrain.train.noise import draw_tables, shift_tables
 from solidgrain.train.run import Run, RunFolder
-from solidgrain.train.sampler import make_sampler
+from solidgrain.train.sampler import Sampler, make_sampler
 from solidgrain.train.settings import Settings
 from solidgrain.train.slices import draw_slices
 from solidgrain.train.space import Space
@@ -89,6 +90,9 @@ class SingleExemplar:
         if self.settings.principal_colors:
             pixels = self.exemplar.flatten(1).double()
             sampler.take_colors(pixels.mean(1), torch.cov(pixels))
+        if self.settings.sampler_start:
+            assert isinstance(sampler, Sampler)
+            begin_as(sampler, self.settings.sampler_start)
         return sampler
 
     def draw(self, generator: torch.Generator) -> Batch:

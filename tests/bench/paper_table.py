@@ -47,7 +47,9 @@ TITLES = {
     "paper": "α:0.1 β:1",
 }
 PRESET = "paper-preset"  # the seventh column
-LOSSES = replace(FAST, alpha=PAPER.alpha, gram_energy=PAPER.gram_energy)  # what the paper weighs against each other is its own
+# What the paper weighs against each other is its own, and no method has a head start: embedded textures are the method's.
+SHARED = ("alpha", "gram_energy", "sampler_start")
+LOSSES = replace(FAST, **{name: getattr(PAPER, name) for name in SHARED})
 COLUMNS: dict[str, Settings] = {**{name: vary(LOSSES, name) for name in TITLES}, PRESET: PAPER}
 SIFID: dict[str, dict[str, tuple[float, float]]] = {  # x 10^5, Portenier et al. 2020, Table 1
     "wood": {

@@ -25,6 +25,7 @@ TINY_SPACE = {
     "report_every": 1,
     "precision": "float32",
     "critic_start": "",
+    "sampler_start": "",
 }
 SIZES = ((130, 150), (200, 128), (160, 160), (129, 171))
 

@@ -36,6 +36,7 @@ TINY = {
     "report_every": 1,
     "precision": "float32",
     "critic_start": "",
+    "sampler_start": "",
 }
 CPU = torch.device("cpu")
 

@@ -52,7 +52,7 @@ def changed(name: str, base: Settings = FAST) -> set[str]:
 
 def test_a_variant_changes_what_its_name_says_and_nothing_else():
     assert changed("paper") == changed("paper", PAPER) == set()
-    assert changed("noise-at-input") == {"noise_at_input", "sampler_rate", "sampler_rate_floor"}
+    assert changed("noise-at-input") == {"noise_at_input", "sampler_start", "sampler_rate", "sampler_rate_floor"}
     assert changed("gan+vgg") == {"style_features"}
     assert changed("a1b0") == {"alpha", "beta"}
     assert changed("a0b1") == {"alpha"}

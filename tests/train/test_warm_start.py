@@ -29,7 +29,10 @@ def small(monkeypatch):
     torch.set_num_threads(1)
     monkeypatch.setattr(loop, "_write_sample", lambda trainer: None)
     monkeypatch.setattr(critic, "CONVOLUTIONS", ((3, 16, 3, True), (16, 32, 3, True), (32, 256, 3, True)))
-    tiny = {"fast": preset("fast", patch=32, critic_start="", **SAME_WIDTH), "fast space": preset("fast space", **TINY_SPACE)}
+    tiny = {
+        "fast": preset("fast", patch=32, critic_start="", sampler_start="", **SAME_WIDTH),
+        "fast space": preset("fast space", **TINY_SPACE),
+    }
     monkeypatch.setattr(settings, "PRESETS", settings.PRESETS | tiny)
 
 
