@@ -21,6 +21,7 @@ FINGERPRINTS = {
 }
 
 FloatArray = npt.NDArray[np.float32]
+DoubleArray = npt.NDArray[np.float64]
 
 
 def read_weights(model: bytes, texture: TextureData) -> list[FloatArray]:
@@ -43,17 +44,25 @@ def read_weights(model: bytes, texture: TextureData) -> list[FloatArray]:
 
 
 def fold(weights: list[FloatArray], texture: TextureData) -> FloatArray:
-    """One texture's perceptron as the kernel takes it (`native/kernel.h`), style folded into the layer that follows.
-
-    W (gamma * y + delta) + b = (W diag(gamma)) y + (W delta + b), in float64, rounded once.
-    """
+    """One texture's perceptron as the kernel takes it (`native/kernel.h`), style folded into the layer that follows."""
     parts = [weights[0], texture.noise_weights[0]]
-    for layer, (weight, bias) in enumerate(zip(weights[1::2], weights[2::2], strict=True), start=1):
-        exact = weight.astype(np.float64)
-        parts += [bias + texture.delta[layer - 1] @ exact, texture.gamma[layer - 1][:, None] * exact]
+    for layer, (weight, bias) in enumerate(unstyled(weights, texture), start=1):
+        parts += [bias, weight]
         if layer < len(texture.noise_weights):
             parts.append(texture.noise_weights[layer])
     return np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
+
+
+def unstyled(weights: list[FloatArray], texture: TextureData) -> list[tuple[DoubleArray, DoubleArray]]:
+    """Weight and bias of each layer after layer 0, without a style before it, in float64.
+
+    W (gamma * y + delta) + b = (W diag(gamma)) y + (W delta + b).
+    """
+    layers = []
+    for gamma, delta, weight, bias in zip(texture.gamma, texture.delta, weights[1::2], weights[2::2], strict=True):
+        exact = weight.astype(np.float64)
+        layers.append((gamma[:, None] * exact, bias + delta @ exact))
+    return layers
 
 
 def _describe(graph: Graph, names: dict[str, int], lines: list[str], weights: list[FloatArray]) -> None:

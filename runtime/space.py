@@ -70,7 +70,7 @@ class Space:
         first, and the texture's pixels are then the smaller picture's. `scale` is by how much it was: the texture remembers
         it, for whoever compares it with the photograph.
         """
-        return self.open(replace(self._mapped(self.code(exemplar), name), scale=float(scale)))
+        return self.open(replace(self.mapped(self.code(exemplar), name), scale=float(scale)))
 
     def code(self, exemplar: npt.ArrayLike) -> FloatArray:
         """z [latent] of a photograph, as in `encode`."""
@@ -82,7 +82,20 @@ class Space:
 
     def texture(self, z: npt.ArrayLike, name: str = "latent") -> Texture:
         """The texture of a latent code z [latent]. Raises BundleError for a code of another length."""
-        return self.open(self._mapped(z, name))
+        return self.open(self.mapped(z, name))
+
+    def mapped(self, z: npt.ArrayLike | None, name: str = "latent") -> TextureData:
+        """What the texture of a latent code z [latent] owns. Raises BundleError for a code of another length."""
+        code = np.asarray(z, np.float32)
+        if code.shape != (self.bundle.manifest["latent"],) or not np.isfinite(code).all():
+            raise BundleError(
+                f"{self.bundle.folder}: a latent code of shape {code.shape}, expected {self.bundle.manifest['latent']} "
+                "finite numbers"
+            )
+        names = ["transforms", "gamma", "delta", "noise_weights"]
+        transforms, gamma, delta, noise_weights = (part[0] for part in self._mapping.run(names, {"z": code[None]}))
+        sampler = self.bundle.sampler_sha256
+        return TextureData(name, sampler, transforms.astype(np.float64), gamma, delta, noise_weights, code)
 
     def blend(self, first: Texture, second: Texture, at: float, name: str = "") -> Texture:
         """The texture between two of this space, linear in z (Sec. 3.2): the first at 0, the second at 1.
@@ -150,26 +163,14 @@ class Space:
         ends = (first, second)
         if at in (0, 1):
             return replace(ends[int(at)], name=name or ends[int(at)].name)
-        mapped = [self._mapped(data.latent, "") for data in ends]
+        mapped = [self.mapped(data.latent, "") for data in ends]
         z = (1 - at) * np.asarray(first.latent) + at * np.asarray(second.latent)
-        between = self._mapped(z, name or f"{first.name}-{second.name}")
+        between = self.mapped(z, name or f"{first.name}-{second.name}")
         arrays = {}
         for key, value in between.arrays().items():
             left = [end.arrays()[key] - of_code.arrays()[key] for end, of_code in zip(ends, mapped, strict=True)]
             arrays[key] = (value + (1 - at) * left[0] + at * left[1]).astype(value.dtype)
         return replace(between, **arrays)
-
-    def _mapped(self, z: npt.ArrayLike | None, name: str) -> TextureData:
-        code = np.asarray(z, np.float32)
-        if code.shape != (self.bundle.manifest["latent"],) or not np.isfinite(code).all():
-            raise BundleError(
-                f"{self.bundle.folder}: a latent code of shape {code.shape}, expected {self.bundle.manifest['latent']} "
-                "finite numbers"
-            )
-        names = ["transforms", "gamma", "delta", "noise_weights"]
-        transforms, gamma, delta, noise_weights = (part[0] for part in self._mapping.run(names, {"z": code[None]}))
-        sampler = self.bundle.sampler_sha256
-        return TextureData(name, sampler, transforms.astype(np.float64), gamma, delta, noise_weights, code)
 
 
 def _graph(bundle: Bundle, name: str, inputs: list[str], outputs: list[str]) -> onnxruntime.InferenceSession:

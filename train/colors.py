@@ -1,7 +1,8 @@
-"""The mean colour of a trained sampler, brought to its exemplar's by its last bias.
+"""The colours of a sampler brought to its exemplar's, by its last layer; the paper does not do this.
 
-A GAN ends a shade off, and neither loss says so as exactly as the photograph does. The paper does not do this. Contrasts stay
-as they were learned: matched as well, they were seen to raise noise along with them.
+Before a training, mean and covariance. After it, the mean alone: a GAN ends a shade off, and neither loss says so as exactly
+as the photograph does. Contrasts then stay as they were learned: matched as well, they were seen to raise noise along with
+them.
 """
 
 from __future__ import annotations
@@ -11,28 +12,63 @@ from torch import Tensor
 
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.noise import draw_tables
-from solidgrain.train.sampler import NoiseAtInputSampler, Sampler
+from solidgrain.train.sampler import NARROWEST, NoiseAtInputSampler, Sampler
 
 INSTANCES, PLACES = 4, 1 << 15  # of noise; in each, so far apart that all are as good as independent
 REACH = 64.0  # units of 64 pixels
+LEAST = 1e-6  # deviation of colours that are not all the same
 RESOLUTION = 64  # texels along each axis of a noise table
 
 
 @torch.no_grad()
 def settle_mean(sampler: Sampler | NoiseAtInputSampler, exemplar: FloatArray) -> None:
     """Let the sampler's mean colour be that of an exemplar [H, W, 3], in place."""
-    missing = torch.from_numpy(exemplar).reshape(-1, 3).double().mean(0) - mean_color(sampler)
+    missing = _pixels(exemplar).mean(0) - mean_color(sampler)
     axes = sampler.color_axes.double().cpu()  # rgb = origin + output axes; all zero if the exemplar has one colour
     sampler.output.bias.add_((missing @ torch.linalg.pinv(axes)).to(sampler.output.bias))
 
 
+@torch.no_grad()
+def settle_covariance(sampler: Sampler, exemplar: FloatArray) -> None:
+    """Let the sampler's colours have the mean and the covariance of an exemplar [H, W, 3], in place.
+
+    Of the linear maps that do so, the one that moves colours least: between normal distributions, optimal transport.
+    """
+    inverse = torch.linalg.pinv(sampler.color_axes.double().cpu())
+    wanted, found = (torch.cov((colors @ inverse).T) for colors in (_pixels(exemplar), colors_of(sampler)))
+    root = _root(found)
+    undone = torch.linalg.inv(root)
+    moved = (undone @ _root(root @ wanted @ root) @ undone).to(sampler.output.bias)  # symmetric
+    sampler.output.weight.copy_(moved @ sampler.output.weight)
+    sampler.output.bias.copy_(moved @ sampler.output.bias)
+    settle_mean(sampler, exemplar)
+
+
+def _root(covariance: Tensor) -> Tensor:
+    """The square root of a covariance, in no direction less than `NARROWEST` of what it is in its widest."""
+    variances, axes = torch.linalg.eigh(covariance)
+    deviations = variances.clamp(min=0).sqrt()
+    least = NARROWEST * max(float(deviations.max()), LEAST)
+    root: Tensor = axes @ torch.diag(deviations.clamp(min=least)) @ axes.T
+    return root
+
+
 def mean_color(sampler: Sampler | NoiseAtInputSampler) -> Tensor:
     """The mean colour [3] of the solid, everywhere; float64."""
+    return colors_of(sampler).mean(0)
+
+
+def colors_of(sampler: Sampler | NoiseAtInputSampler) -> Tensor:
+    """Colours [N, 3] of the solid, from everywhere, as they are before they are clipped; float64."""
     device = sampler.directions.device
     generator = torch.Generator(device).manual_seed(7)
-    means = []
+    colors = []
     for _ in range(INSTANCES):
         tables = draw_tables(len(sampler.directions), RESOLUTION, generator)
         points = REACH * torch.rand(1, PLACES, 3, generator=generator, device=device)
-        means.append(sampler(tables, points)[0].double().mean(0))
-    return torch.stack(means).mean(0).cpu()
+        colors.append(sampler(tables, points)[0].double())
+    return torch.cat(colors).cpu()
+
+
+def _pixels(exemplar: FloatArray) -> Tensor:
+    return torch.from_numpy(exemplar).reshape(-1, 3).double()

@@ -1,43 +1,63 @@
-"""What S begins a training as: the sampler of another material, but for its colours.
+"""What S begins a training as: the texture that a space, which has seen many materials, makes of the photograph.
 
-Most of a short training goes into octaves and hidden layers that make any spots and veins at all, and another material's are
-nearer to this one's than random ones. They come from an embedded texture. Its output layer speaks of its own colours, and
-stays behind.
+Most of a short training would go into octaves and hidden layers that make any grains and veins at all. Only the colours are not
+taken as the space guesses them (colors.py).
 """
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
-from solidgrain.runtime.bundle import SAMPLER, TEXTURE, embedded_folder, open_bundle
-from solidgrain.runtime.errors import BundleError, TrainingError
-from solidgrain.runtime.fold import read_weights
-from solidgrain.runtime.texture_file import read_texture
+from solidgrain.runtime.bundle import SAMPLER
+from solidgrain.runtime.errors import TrainingError
+from solidgrain.runtime.fold import DoubleArray, read_weights, unstyled
+from solidgrain.runtime.space import Space, load_space
+from solidgrain.train.colors import settle_covariance
+from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.layers import Linear
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.slices import UNIT
 
+ROWS = 3  # of as many crops of the photograph, whose latent codes are averaged
+
 
 @torch.no_grad()
-def begin_as(sampler: Sampler, name: str) -> None:
-    """Give a sampler the octaves and the hidden layers of an embedded texture. A grain of the sampler's own stretches them.
+def begin_as(sampler: Sampler, name: str, exemplar: FloatArray) -> None:
+    """Make a sampler what an embedded space makes of an exemplar [H, W, 3]. A grain of the sampler's own stretches its octaves.
 
-    Raises BundleError if there is no such texture, TrainingError if it is of another size.
+    Raises BundleError if there is no such space, TrainingError if its sampler has another size.
     """
-    folder = open_bundle(embedded_folder(name)).folder
-    if not (folder / TEXTURE).is_file():
-        raise BundleError(f"sampler_start {name}: is a space; expected an embedded texture")
-    texture = read_texture(folder / TEXTURE)
+    space = load_space(name)
+    texture = space.mapped(mean_code(space, exemplar))
     wanted, found = sampler.noise_weights.shape, texture.noise_weights.shape
     if found != wanted:
         sizes = " and ".join(f"{bins * octaves} octaves, {width} units a layer" for bins, octaves, width in (found, wanted))
         raise TrainingError(f"sampler_start {name}: it and this training have {sizes}; expected the same, or no start")
-    first, *others = read_weights((folder / SAMPLER).read_bytes(), texture)
-    unstretched = sampler.octave_scale[..., 2:]  # no grain runs along z
-    sampler.directions.copy_(torch.from_numpy(texture.transforms * UNIT) / unstretched)
+    first, *others = read_weights((space.bundle.folder / SAMPLER).read_bytes(), texture)
+    scale = sampler.octave_scale[..., 2:].double().cpu()  # no grain runs along z
+    sampler.directions.copy_(torch.from_numpy(texture.transforms * UNIT) / scale)
     sampler.noise_weights.copy_(torch.from_numpy(texture.noise_weights))
-    below, *hidden = (layer for layer in sampler.hidden if isinstance(layer, Linear))
-    below.bias.copy_(torch.tensor(first) - below.effective_weight() @ sampler.constant)
-    for layer, weight, bias in zip(hidden, others[0:-2:2], others[1:-2:2], strict=True):
-        layer.weight.copy_(torch.tensor(weight).T / layer.gain)
-        layer.bias.copy_(torch.tensor(bias))
+    below, *above = (layer for layer in (*sampler.hidden, sampler.output) if isinstance(layer, Linear))
+    below.bias.copy_(torch.tensor(first).to(below.bias) - below.effective_weight() @ sampler.constant)
+    *hidden, (to_rgb, rgb) = unstyled([first, *others], texture)
+    inverse = torch.linalg.pinv(sampler.color_axes.double().cpu()).numpy()
+    for layer, (weight, bias) in zip(above, [*hidden, (to_rgb @ inverse, rgb @ inverse)], strict=True):
+        _set(layer, weight, bias)
+    settle_covariance(sampler, exemplar)
+
+
+def mean_code(space: Space, exemplar: FloatArray) -> FloatArray:
+    """The latent code of a photograph as a whole; one that is smaller than the encoder's patch is mirrored at its edges."""
+    missing = [max(0, space.patch - extent) for extent in exemplar.shape[:2]]
+    padded = np.pad(exemplar, [(0, missing[0]), (0, missing[1]), (0, 0)], mode="symmetric")
+    tops, lefts = (np.linspace(0, extent - space.patch, ROWS).astype(int) for extent in padded.shape[:2])
+    codes = [space.code(padded[top:, left:][: space.patch, : space.patch]) for top in tops for left in lefts]
+    mean: FloatArray = np.mean(codes, 0)
+    return mean
+
+
+def _set(layer: Linear, weight: DoubleArray, bias: DoubleArray) -> None:
+    """weight [inputs, outputs] and bias as they are used, x W + b."""
+    layer.weight.copy_(torch.from_numpy(weight.T / layer.gain))
+    layer.bias.copy_(torch.from_numpy(bias))

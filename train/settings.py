@@ -60,7 +60,7 @@ class Settings:
     # Optimisation
     critic_contrast: float = 0.0  # root mean square to which D sees faint exemplars stretched; 0: as they are
     critic_start: str = ""  # the embedded space whose critic D starts as, else N(0,1)
-    sampler_start: str = ""  # the embedded texture whose octaves and hidden layers S starts with, else random ones
+    sampler_start: str = ""  # the embedded space whose texture of the exemplar S starts as, else N(0,1)
     warm_start: str = ""  # the run or checkpoint file whose weights were taken over instead, for the record
     critic_rate: float = 1e-3
     critic_rate_floor: float = 1e-3
@@ -120,7 +120,8 @@ FAST = Settings(
     alpha=0.03,
     critic_contrast=0.15,
     critic_start="stone",
-    sampler_start="granite",
+    octaves=32,
+    sampler_start="stone",
     principal_colors=True,
     shared_noise=True,
     relative_gram=True,

@@ -45,6 +45,9 @@ class Probe(NamedTuple):
 class Task(Protocol):
     def make_model(self, generator: torch.Generator) -> nn.Module: ...
 
+    def begin(self, model: nn.Module) -> None:
+        """What is to be done to a new model before it is trained."""
+
     def draw(self, generator: torch.Generator) -> Batch: ...
 
     def probe(self) -> Probe: ...
@@ -81,6 +84,7 @@ class SingleExemplar:
 
     def __init__(self, run: Run, device: torch.device) -> None:
         self.settings, self.device = run.settings, device
+        self.pixels = run.exemplar
         self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
         self.stretch = stretch_to(run.settings.critic_contrast, run.exemplar, device)
         self.noise = Noise(run.settings, device)
@@ -90,10 +94,12 @@ class SingleExemplar:
         if self.settings.principal_colors:
             pixels = self.exemplar.flatten(1).double()
             sampler.take_colors(pixels.mean(1), torch.cov(pixels))
-        if self.settings.sampler_start:
-            assert isinstance(sampler, Sampler)
-            begin_as(sampler, self.settings.sampler_start)
         return sampler
+
+    def begin(self, model: nn.Module) -> None:
+        if self.settings.sampler_start:
+            assert isinstance(model, Sampler)
+            begin_as(model, self.settings.sampler_start, self.pixels)
 
     def draw(self, generator: torch.Generator) -> Batch:
         inputs = self.noise.draw(generator), draw_slices(self.settings, generator)
@@ -124,6 +130,9 @@ class TextureSpace:
             device = generator.device
             space.sampler.take_colors(torch.zeros(3, device=device), collection.mean_covariance(self.members).to(device))
         return space
+
+    def begin(self, model: nn.Module) -> None:
+        """As it was made."""
 
     def draw(self, generator: torch.Generator) -> Batch:
         settings, device = self.settings, self.device

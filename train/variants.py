@@ -23,7 +23,7 @@ from solidgrain.train.settings import Settings
 
 CHANGES: dict[str, dict[str, Any]] = {
     "paper": {},
-    "noise-at-input": {"noise_at_input": True, "sampler_start": ""},  # embedded textures are of the method's sampler
+    "noise-at-input": {"noise_at_input": True, "sampler_start": ""},  # the embedded space has the method's
     "gan+vgg": {"style_features": "vgg"},
     "a1b0": {"alpha": 1.0, "beta": 0.0},
     "a0b1": {"alpha": 0.0, "beta": 1.0},

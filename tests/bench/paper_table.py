@@ -47,8 +47,8 @@ TITLES = {
     "paper": "α:0.1 β:1",
 }
 PRESET = "paper-preset"  # the seventh column
-# What the paper weighs against each other is its own, and no method has a head start: embedded textures are the method's.
-SHARED = ("alpha", "gram_energy", "sampler_start")
+# What the paper weighs against each other is its own, and no method has a head start: the embedded space is the method's.
+SHARED = ("alpha", "gram_energy", "sampler_start", "octaves")
 LOSSES = replace(FAST, **{name: getattr(PAPER, name) for name in SHARED})
 COLUMNS: dict[str, Settings] = {**{name: vary(LOSSES, name) for name in TITLES}, PRESET: PAPER}
 SIFID: dict[str, dict[str, tuple[float, float]]] = {  # x 10^5, Portenier et al. 2020, Table 1

@@ -51,6 +51,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "fast": ("the preset", FAST),
     "critic": ("D starts from N(0,1)", as_paper("critic_start")),
     "sampler": ("S starts from N(0,1)", as_paper("sampler_start")),
+    "octaves": ("the same, with 16 octaves", as_paper("sampler_start", "octaves")),
     "contrast": ("D sees colours as they are", as_paper("critic_contrast")),
     "colors": ("S speaks red, green, blue", as_paper("principal_colors")),
     "random-rgb": ("both of these", as_paper("critic_start", "principal_colors")),

@@ -83,8 +83,8 @@ def test_options_that_predate_variants_are_the_method():
 def test_noise_at_the_input_is_a_plain_perceptron_on_the_noise():
     sampler = make_sampler(vary(FAST, "noise-at-input"), generator())
     assert isinstance(sampler, NoiseAtInputSampler)
-    assert [tuple(layer.weight.shape) for layer in sampler.hidden] == [(128, 16)] + 4 * [(128, 128)]
-    tables, points = torch.randn(16, 64, 64, 64, generator=generator()), torch.rand(1, 9, 3, generator=generator())
+    assert [tuple(layer.weight.shape) for layer in sampler.hidden] == [(128, 32)] + 4 * [(128, 128)]
+    tables, points = torch.randn(32, 64, 64, 64, generator=generator()), torch.rand(1, 9, 3, generator=generator())
     x = sampler.noise(tables, points)
     for layer in sampler.hidden:
         x = torch.nn.functional.leaky_relu(layer(x), 0.2)
