@@ -32,8 +32,8 @@ def begin_as(sampler: Sampler, name: str, exemplar: FloatArray) -> None:
     texture = space.mapped(mean_code(space, exemplar))
     wanted, found = sampler.noise_weights.shape, texture.noise_weights.shape
     if found != wanted:
-        sizes = " and ".join(f"{bins * octaves} octaves, {width} units a layer" for bins, octaves, width in (found, wanted))
-        raise TrainingError(f"sampler_start {name}: it and this training have {sizes}; expected the same, or no start")
+        sizes = (f"{bins * octaves} octaves and {width} units a layer" for bins, octaves, width in (found, wanted))
+        raise TrainingError(f'sampler_start {name}: has {", this training ".join(sizes)}; give it as many, or sampler_start=""')
     first, *others = read_weights((space.bundle.folder / SAMPLER).read_bytes(), texture)
     scale = sampler.octave_scale[..., 2:].double().cpu()  # no grain runs along z
     sampler.directions.copy_(torch.from_numpy(texture.transforms * UNIT) / scale)

@@ -32,7 +32,7 @@ def little_work(monkeypatch):
     """No pictures, and a critic of three layers: what is tested here does not depend on either."""
     monkeypatch.setattr(loop, "_write_sample", lambda trainer: None)
     monkeypatch.setattr(critic, "CONVOLUTIONS", ((3, 16, 3, True), (16, 32, 3, True), (32, 256, 3, True)))
-    monkeypatch.setattr(settings, "PRESETS", settings.PRESETS | {"fast": preset("fast", critic_start="")})
+    monkeypatch.setattr(settings, "PRESETS", settings.PRESETS | {"fast": preset("fast", critic_start="", sampler_start="")})
     monkeypatch.setattr(loop, "SETTLING", 0)
 
 

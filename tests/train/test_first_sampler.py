@@ -72,7 +72,8 @@ def test_the_whole_photograph_is_encoded_and_a_small_one_mirrored():
 
 @pytest.mark.parametrize("changes", [{"octaves": 16}, {"width": 64}])
 def test_a_sampler_of_another_size_is_one_line(changes):
-    with pytest.raises(TrainingError, match=r"^sampler_start stone: .* 32 octaves, 128 units a layer and "):
+    message = r"^sampler_start stone: has 32 octaves and 128 units a layer, this training \d+ octaves and"
+    with pytest.raises(TrainingError, match=message):
         begin_as(fresh(**changes), "stone", blotches(128, 128))
 
 
