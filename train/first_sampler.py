@@ -34,13 +34,13 @@ def begin_as(sampler: Sampler, name: str, exemplar: FloatArray) -> None:
     if found != wanted:
         sizes = (f"{bins * octaves} octaves and {width} units a layer" for bins, octaves, width in (found, wanted))
         raise TrainingError(f'sampler_start {name}: has {", this training ".join(sizes)}; give it as many, or sampler_start=""')
-    first, *others = read_weights((space.bundle.folder / SAMPLER).read_bytes(), texture)
+    weights = read_weights((space.bundle.folder / SAMPLER).read_bytes(), texture)
     scale = sampler.octave_scale[..., 2:].double().cpu()  # no grain runs along z
     sampler.directions.copy_(torch.from_numpy(texture.transforms * UNIT) / scale)
     sampler.noise_weights.copy_(torch.from_numpy(texture.noise_weights))
     below, *above = (layer for layer in (*sampler.hidden, sampler.output) if isinstance(layer, Linear))
-    below.bias.copy_(torch.tensor(first).to(below.bias) - below.effective_weight() @ sampler.constant)
-    *hidden, (to_rgb, rgb) = unstyled([first, *others], texture)
+    below.bias.copy_(torch.tensor(weights[0]).to(below.bias) - below.effective_weight() @ sampler.constant)
+    *hidden, (to_rgb, rgb) = unstyled(weights, texture)
     inverse = torch.linalg.pinv(sampler.color_axes.double().cpu()).numpy()
     for layer, (weight, bias) in zip(above, [*hidden, (to_rgb @ inverse, rgb @ inverse)], strict=True):
         _set(layer, weight, bias)
