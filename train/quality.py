@@ -35,6 +35,7 @@ Measures = dict[str, float]
 FRECHET_LAYERS, GRAM_LAYERS = (1, 3), STYLE_LAYERS
 LARGEST_CROP = 256  # pixels
 COMPARED = 6  # crops of an exemplar at most, all over it
+REPEATED = 0.1  # of the median difference between two crops, below which one shows the other's period again
 SMALLEST = 64  # pixels along each side of an exemplar: its crops must outlast the pyramids
 SMALLEST_FLOOR = 1e-6  # between colours: a photograph's is a thousand times that
 
@@ -64,7 +65,7 @@ def evaluate(
     measure = Measure(inception)
     image = as_image(exemplar)
     size = min(image.shape[2] // 2, image.shape[3] // 2, LARGEST_CROP)
-    squares = spread_out(disjoint_crops(image, size), COMPARED)
+    squares = spread_out(distinct(disjoint_crops(image, size)), COMPARED)
     crops = [measure.statistics(square) for square in squares]
     floor = _mean(measure.distances(a, b) for i, a in enumerate(crops) for b in crops[:i])
     if floor["color"] < SMALLEST_FLOOR:
@@ -99,6 +100,16 @@ def disjoint_crops(image: Tensor, size: int) -> list[Tensor]:
     """The image [1, 3, H, W] cut into squares, from the top left."""
     rows, columns = (range(0, extent - size + 1, size) for extent in image.shape[2:])
     return [image[..., top : top + size, left : left + size] for top in rows for left in columns]
+
+
+def distinct(squares: list[Tensor]) -> list[Tensor]:
+    """Without those that repeat an earlier one, as where a photograph holds two periods: a floor is not between equals."""
+    step = max(1, squares[0].shape[2] // 32)
+    seen = torch.cat([square[..., ::step, ::step].flatten(1) for square in squares])
+    apart = torch.cdist(seen, seen, p=1)
+    typical = apart[torch.ones_like(apart).triu(1).bool()].median()
+    repeats = (apart < REPEATED * typical).tril(-1).any(1).tolist()
+    return [square for square, repeat in zip(squares, repeats, strict=True) if not repeat]
 
 
 def spread_out(squares: list[Tensor], count: int) -> list[Tensor]:

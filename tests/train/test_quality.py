@@ -13,7 +13,7 @@ pytest.importorskip(
 from solidgrain.export.figures import make_figures
 from solidgrain.runtime import ExemplarError, load_space
 from solidgrain.train.copying import Copying
-from solidgrain.train.quality import Evaluation, disjoint_crops, evaluate, spread_out
+from solidgrain.train.quality import Evaluation, disjoint_crops, distinct, evaluate, spread_out
 from tests.bench import cells
 from tests.train.conftest import blotches
 
@@ -129,6 +129,17 @@ def test_crops_of_a_large_exemplar_are_all_over_it():
     rows, columns = zip(*(divmod(int(square.mean()), 4) for square in squares), strict=True)
     assert set(rows) == set(columns) == {0, 1, 2, 3}
     assert len(spread_out(disjoint_crops(image[..., :16, :16], 8), 6)) == 4
+
+
+def test_crops_that_repeat_each_other_count_once():
+    image = torch.from_numpy(blotches(128, 128)).permute(2, 0, 1)[None]
+    squares = disjoint_crops(image, 64)
+    twice = torch.cat([image, image + 0.002], dim=3)  # two periods, a level apart
+    left = distinct(disjoint_crops(twice, 64))
+    assert len(left) == len(squares) == 4
+    assert all(torch.equal(a, b) for a, b in zip(left, squares, strict=True))
+    assert len(distinct(squares)) == 4
+    assert len(distinct(disjoint_crops(torch.tile(image[..., :64, :64], (2, 2)), 64))) == 4  # no two differ: evaluate says so
 
 
 def test_inception_weights_that_are_missing_are_noticed_before_measuring(solidgrain, toy_folder, tmp_path):
