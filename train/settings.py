@@ -126,6 +126,7 @@ FAST = Settings(
     shared_noise=True,
     relative_gram=True,
     gram_energy=True,
+    sampler_rate=4e-3,
     octave_rate=0.1,
 )
 """Tuned for few CPU minutes. How it departs from the paper, and why, is in docs/training.md."""
