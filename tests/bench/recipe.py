@@ -47,11 +47,19 @@ def as_paper(*names: str) -> Settings:
     return replace(FAST, **{name: getattr(PAPER, name) for name in names})
 
 
+def from_noise(*names: str) -> Settings:
+    """The same, with S starting from N(0,1): some settings say how, and say nothing where it starts as a stone."""
+    return as_paper("sampler_start", *names)
+
+
 ROWS: dict[str, tuple[str, Settings]] = {
     "fast": ("the preset", FAST),
     "critic": ("D starts from N(0,1)", as_paper("critic_start")),
-    "sampler": ("S starts from N(0,1)", as_paper("sampler_start")),
-    "octaves": ("the same, with 16 octaves", as_paper("sampler_start", "octaves")),
+    "sampler": ("S starts from N(0,1)", from_noise()),
+    "octaves": ("the same, with 16 octaves", from_noise("octaves")),
+    "octave-span": ("the same, octaves 2^i", from_noise("octave_span")),
+    "orthogonal": ("the same, T_i from N(0,1)", from_noise("orthogonal_start")),
+    "noise-weight": ("the same, A from N(0,1)", from_noise("noise_weight_start")),
     "contrast": ("D sees colours as they are", as_paper("critic_contrast")),
     "colors": ("S speaks red, green, blue", as_paper("principal_colors")),
     "random-rgb": ("both of these", as_paper("critic_start", "principal_colors")),
@@ -59,10 +67,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "gram": ("Gram differences as they are", as_paper("relative_gram")),
     "pooled": ("Gram matrices of the batch's mean", replace(FAST, pooled_gram=True)),
     "octave-rate": ("T_i as fast as the rest", as_paper("octave_rate")),
-    "octave-span": ("octaves 2^i", as_paper("octave_span")),
     "fresh-noise": ("fresh noise tables", as_paper("shared_noise")),
-    "orthogonal": ("T_i from N(0,1)", as_paper("orthogonal_start")),
-    "noise-weight": ("A from N(0,1)", as_paper("noise_weight_start")),
     "critic-rate": ("D learns twice as fast", as_paper("critic_rate", "critic_rate_floor")),
     "sampler-rate": (
         "constant rates of S", as_paper("sampler_rate", "sampler_rate_floor", "sampler_half_life"),
