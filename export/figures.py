@@ -29,7 +29,7 @@ class Figures:
 
 def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
     rows = []
-    column = ("exemplar turned by 90°",) if evaluation.turned else ()  # what earlier versions found has none
+    column = (f"exemplar {evaluation.turn}",) if evaluation.turned else ()  # what earlier versions found has none
     for name, floor in evaluation.floor.items():
         spreads = (evaluation.axis[name], evaluation.oblique[name])
         turned = (f"{evaluation.turned[name]:.2f}" for _ in column)

@@ -49,8 +49,13 @@ class Evaluation:
     floor: Measures
     axis: dict[str, tuple[float, float]]
     oblique: dict[str, tuple[float, float]]
-    turned: Measures = field(default_factory=dict)  # the exemplar itself, turned by 90°: far above 1 where it has a direction
+    turned: Measures = field(default_factory=dict)  # the exemplar itself, as `turn` says: far above 1 where it has a direction
     nonstationarity: float = 0.0  # of the exemplar
+    grain: str = "none"  # the image axis about which slices turn
+
+    @property
+    def turn(self) -> str:
+        return "turned by 90°" if self.grain == "none" else "mirrored across its grain"
 
 
 @torch.no_grad()
@@ -73,8 +78,8 @@ def evaluate(
             f"the exemplar has the same colours in each of its squares of {size}² pixels, so that nothing tells how far apart "
             "its own parts are; expected a photograph that neither repeats itself nor is of one colour, or one period of it"
         )
-    quarter = [measure.statistics(square.rot90(1, (2, 3))) for square in squares]
-    turned = _mean(measure.distances(a, b) for i, a in enumerate(crops) for j, b in enumerate(quarter) if i != j)
+    others = [measure.statistics(turned_as_slices_are(square, grain)) for square in squares]
+    turned = _mean(measure.distances(a, b) for i, a in enumerate(crops) for j, b in enumerate(others) if i != j)
 
     def ratios(rotation_of: Callable[[int, torch.Generator], Tensor]) -> dict[str, tuple[float, float]]:
         measured = []
@@ -93,7 +98,13 @@ def evaluate(
         oblique=ratios(lambda seed, generator: oblique_rotation(generator, grain)),
         turned={name: turned[name] / floor[name] for name in floor},
         nonstationarity=nonstationarity(exemplar),
+        grain=grain,
     )
+
+
+def turned_as_slices_are(image: Tensor, grain: str) -> Tensor:
+    """What slices show as often as the image itself: it turned by 90°, or by 180° about its grain, as seen from behind."""
+    return image.rot90(1, (2, 3)) if grain == "none" else image.flip(2 if grain == "x" else 3)
 
 
 def disjoint_crops(image: Tensor, size: int) -> list[Tensor]:

@@ -168,11 +168,11 @@ def rows_table(found: Found, marks: Sequence[float]) -> str:
 def exemplars_table(measured: Mapping[str, Mapping[str, Any]], mark: float) -> str:
     """The preset's figures at a mark, one line per exemplar and seed: axis-aligned / oblique slices; their median and worst.
 
-    Last, VGG-Fréchet of the exemplar itself, turned by 90°.
+    Last, VGG-Fréchet of the exemplar itself, turned by 90°, or with a grain mirrored across it.
     """
     finished = [cell for cell in measured.values() if cell["mark"] == mark and "quality" in cell]
     names = list(finished[0]["quality"]["floor"]) if finished else []
-    lines = titles(f"the preset, {mark:g} min: axis-aligned / oblique", ["iterations", *names, "turned by 90°"])
+    lines = titles(f"the preset, {mark:g} min: axis-aligned / oblique", ["iterations", *names, "itself, turned"])
     for cell in finished:
         turned = cell["quality"]["turned"][SHOWN[0]]
         pairs = [pair(cell["quality"], name) for name in names]

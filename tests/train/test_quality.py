@@ -52,6 +52,22 @@ def test_an_exemplar_with_a_direction_is_far_from_itself_turned():
     assert lying["vgg_frechet"] > 2 * even["vgg_frechet"]
 
 
+@pytest.mark.parametrize("grain", ["x", "y"])
+def test_a_grained_exemplar_that_is_lit_from_one_side_is_far_from_itself_mirrored(grain):
+    """Slices about the grain show its ridges from behind, too."""
+    place = np.arange(160.0)[:, None] + 2 * np.random.default_rng(0).normal(size=160).cumsum()
+    lit, even = place % 16 / 16, abs(place % 16 - 8) / 8
+
+    def mirrored(ridges):
+        exemplar = (blotches(160, 160) + ridges[..., None].astype(np.float32)) / 2
+        exemplar = exemplar if grain == "x" else exemplar.transpose(1, 0, 2).copy()
+        evaluation = evaluate(exemplar, lambda points, seed: np.resize(exemplar, (len(points), 3)), 1, grain)
+        assert evaluation.turn == "mirrored across its grain"
+        return evaluation.turned["vgg_frechet"]
+
+    assert mirrored(lit) > 2 * mirrored(even)
+
+
 def test_white_noise_scores_far_above_one():
     evaluation = evaluate(
         EXEMPLAR, lambda points, seed: np.random.default_rng(seed).random((len(points), 3), np.float32), slices=2
