@@ -83,7 +83,8 @@ ROWS: dict[str, tuple[str, Settings]] = {
 
 def main(argv: Sequence[str] | None = None) -> None:
     arguments = parse(argv)
-    exemplars = {path.stem: middle(path, arguments.largest) for path in arguments.exemplar or DEFAULTS}
+    chosen = arguments.exemplar if arguments.exemplar or arguments.anisotropic else DEFAULTS
+    exemplars = {path.stem: middle(path, arguments.largest) for path in chosen}
     grained = {path.stem: middle(path, arguments.largest) for path in arguments.anisotropic}
     device, _ = cells.prepare(arguments, marks=arguments.marks, largest=arguments.largest)
     for seed in range(arguments.seeds):

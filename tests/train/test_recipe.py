@@ -84,3 +84,11 @@ def test_what_cannot_be_run_is_refused_in_one_line(small, tmp_path, capsys):
     assert cells.reported(lambda: recipe.main([*small, "--exemplar", str(tmp_path / "none.png")])) == 2
     assert "no such file" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_photographs_with_a_grain_take_the_place_of_the_three_too(small, tmp_path):
+    flags = ["--anisotropic" if flag == "--exemplar" else flag for flag in small]
+    recipe.main([*flags, "--only", "fast"])
+    found = json.loads((tmp_path / "out" / "table.json").read_text())["fast"]
+    assert [cell["exemplar"] for cell in found.values()] == ["blotches-0", "blotches-0"]
+    assert all(cell["settings"]["grain"] != "none" for cell in found.values())
