@@ -13,7 +13,7 @@ def write_card(name: str, training: dict[str, Any]) -> str:
     settings = training["settings"]
     rows = [
         ("settings", f"preset `{settings['preset']}`, seed {settings['seed']}"),
-        ("patches", f"{settings['batch']} of {settings['patch']}² pixels per iteration"),
+        ("patches", f"{settings['batch']} of {_sides(training)} pixels per iteration"),
         ("octaves", f"{settings['octaves']}, span {settings['octave_span']:g}"),
         ("slices", "turned freely" if settings["grain"] == "none" else f"turned about the {settings['grain']} axis only"),
         ("iterations", f"{training['iterations']:,}"),
@@ -37,6 +37,13 @@ def write_card(name: str, training: dict[str, Any]) -> str:
     kind = "A space of solid textures" if settings.get("latent") else "A solid texture"
     lines = [f"# {name}", "", f"{kind}, trained on:", "", *exemplars, "", "| | |", "|---|---|"]
     return "\n".join([*lines, *(f"| {label} | {value} |" for label, value in rows), ""])
+
+
+def _sides(training: dict[str, Any]) -> str:
+    """How large patches were at first, and later if they grew."""
+    settings, last = training["settings"], training.get("last_patch")
+    grew = f", {last}² from iteration {settings.get('later_from')} on," if last not in (None, settings["patch"]) else ""
+    return f"{settings['patch']}²{grew}"
 
 
 def _reduced(entry: dict[str, Any]) -> str:

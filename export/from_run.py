@@ -123,5 +123,6 @@ def provenance(run: Run, state: dict[str, Any]) -> dict[str, Any]:
         "minutes": round(state["seconds"] / 60, 1),
         "revision": run.revision,
         "settings": to_json(run.settings),
+        "last_patch": run.settings_at(state["iteration"] - 1).patch,
         "losses": next(reversed(run.stats_until(state["iteration"])), {}),
     }

@@ -297,6 +297,8 @@ def make_settings(arguments: argparse.Namespace) -> Settings:
 
     changes = {name: getattr(arguments, name) for name in ("patch", "batch", "seed", "precision")}
     changes = {name: value for name, value in changes.items() if value is not None}
+    if "patch" in changes:
+        changes["later_patch"] = 0  # what was asked for, all along
     if arguments.warm_start:
         changes["warm_start"] = arguments.warm_start.resolve().name
     if changes.get("patch", SMALLEST_PATCH) < SMALLEST_PATCH:

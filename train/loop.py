@@ -78,7 +78,7 @@ class Trainer:
         """
         settings, started = self.settings, time.monotonic()
         self._set_rates()
-        batch = self.task.draw(self.generator)
+        batch = self.task.draw(self.iteration, self.generator)
         fake, real = batch.stretch(self.synthesise(batch)), batch.stretch(batch.real)  # (B, 3, patch, patch)
 
         critic_loss, penalty = torch.zeros(()), None
@@ -117,7 +117,7 @@ class Trainer:
         """The batch's slices, as images."""
         with self._autocast():  # the points are made outside it: in bfloat16 they are off by a tenth of a pixel
             rgb: Tensor = self.sampler(*batch.inputs)
-        return rgb.float().reshape(-1, self.settings.patch, self.settings.patch, 3).permute(0, 3, 1, 2)
+        return rgb.float().reshape(-1, *batch.real.shape[2:], 3).permute(0, 3, 1, 2)
 
     def _move(self, model: nn.Module, optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
         """One step of a model down its loss."""

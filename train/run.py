@@ -16,7 +16,7 @@ import shutil
 import subprocess
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -120,6 +120,12 @@ class Run(RunFolder):
     def sha256(self) -> str:
         """Of the exemplar's pixels."""
         return pixels_sha256(self.exemplar)
+
+    def settings_at(self, iteration: int) -> Settings:
+        """The settings of one iteration: later patches are larger, where the exemplar has room for them."""
+        settings = self.settings
+        fits = 0 < 2 * settings.later_patch <= min(self.exemplar.shape[:2])
+        return replace(settings, patch=settings.later_patch) if fits and iteration >= settings.later_from else settings
 
 
 def create_run(folder: Path, settings: Settings, exemplar: FloatArray, source: Source, budget: Budget) -> Run:

@@ -33,6 +33,8 @@ class Settings:
 
     # Slices (Sec. 4, implementation details)
     patch: int = 64  # pixels along each side of a patch
+    later_patch: int = 0  # the same from iteration `later_from` on, if the exemplar is twice as large; 0: as before
+    later_from: int = 800
     batch: int = 4
     transposed: bool = True  # real patches of isotropic materials are also transposed by chance, not only flipped
     # uniform on SO(3), the authors' three angles in [0°, 90°], or along the axes only (Henzler et al. 2020)
@@ -122,6 +124,7 @@ FAST = Settings(
     critic_start="stone",
     octaves=32,
     sampler_start="stone",
+    later_patch=128,
     principal_colors=True,
     shared_noise=True,
     relative_gram=True,
@@ -162,6 +165,7 @@ PRESETS = {
         **SPACE,
         alpha=0.1,
         sampler_start="",
+        later_patch=0,
         color_moments=True,
         pooled_gram=True,
         gram_energy=False,
@@ -173,7 +177,7 @@ PRESETS = {
     "paper space": replace(PAPER, **SPACE, octave_span=15.5),  # 2^(i/2)
 }
 RETIRED = {"keep_best"}  # settings of earlier versions: the result is the last average now
-PRESET_ITERATIONS = {"fast": 2000, "paper": 100_000, "fast space": 30_000, "paper space": 300_000}
+PRESET_ITERATIONS = {"fast": 1200, "paper": 100_000, "fast space": 30_000, "paper space": 300_000}
 
 
 def preset(name: str, **changes: Any) -> Settings:

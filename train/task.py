@@ -48,7 +48,7 @@ class Task(Protocol):
     def begin(self, model: nn.Module) -> None:
         """What is to be done to a new model before it is trained."""
 
-    def draw(self, generator: torch.Generator) -> Batch: ...
+    def draw(self, iteration: int, generator: torch.Generator) -> Batch: ...
 
     def probe(self) -> Probe: ...
 
@@ -83,8 +83,7 @@ class SingleExemplar:
     """Sec. 3.1."""
 
     def __init__(self, run: Run, device: torch.device) -> None:
-        self.settings, self.device = run.settings, device
-        self.pixels = run.exemplar
+        self.run, self.settings, self.device = run, run.settings, device
         self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
         self.stretch = stretch_to(run.settings.critic_contrast, run.exemplar, device)
         self.noise = Noise(run.settings, device)
@@ -99,11 +98,12 @@ class SingleExemplar:
     def begin(self, model: nn.Module) -> None:
         if self.settings.sampler_start:
             assert isinstance(model, Sampler)
-            begin_as(model, self.settings.sampler_start, self.pixels)
+            begin_as(model, self.settings.sampler_start, self.run.exemplar)
 
-    def draw(self, generator: torch.Generator) -> Batch:
-        inputs = self.noise.draw(generator), draw_slices(self.settings, generator)
-        return Batch(inputs, exemplar.draw_patches(self.exemplar, self.settings, generator), self.stretch)
+    def draw(self, iteration: int, generator: torch.Generator) -> Batch:
+        settings = self.run.settings_at(iteration)
+        inputs = self.noise.draw(generator), draw_slices(settings, generator)
+        return Batch(inputs, exemplar.draw_patches(self.exemplar, settings, generator), self.stretch)
 
     def probe(self) -> Probe:
         return Probe(_probe_inputs(self.settings, 1, self.device), [self.exemplar])
@@ -134,7 +134,7 @@ class TextureSpace:
     def begin(self, model: nn.Module) -> None:
         """As it was made."""
 
-    def draw(self, generator: torch.Generator) -> Batch:
+    def draw(self, iteration: int, generator: torch.Generator) -> Batch:
         settings, device = self.settings, self.device
         tables, points = self.noise.draw(generator), draw_slices(settings, generator)
         order = torch.randperm(len(self.members), generator=generator, device=device).tolist()

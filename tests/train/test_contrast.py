@@ -54,14 +54,14 @@ def test_each_image_of_a_batch_has_its_own():
 
 def test_slices_and_patches_of_a_training_are_stretched_alike(tmp_path, photograph):
     trainer = Trainer(new_run(tmp_path / "run", photograph, critic_contrast=5.0), CPU)
-    batch = trainer.task.draw(trainer.generator)
+    batch = trainer.task.draw(0, trainer.generator)
     assert batch.stretch.gain.item() > 10
     assert deviation(batch.stretch(batch.real)).min() > 10 * deviation(batch.real).min()
 
 
 def test_a_space_stretches_each_exemplar_by_itself(tmp_path):
     trainer = Trainer(new_space(tmp_path / "space", photographs(tmp_path / "stones", 3), critic_contrast=0.5), CPU)
-    batch = trainer.task.draw(trainer.generator)
+    batch = trainer.task.draw(0, trainer.generator)
     assert batch.stretch.gain.shape == (len(batch.real), 1, 1, 1)
     torch.testing.assert_close(deviation(batch.stretch(batch.real)), batch.stretch.gain.flatten() * deviation(batch.real))
     assert (batch.stretch.gain > 1).all()

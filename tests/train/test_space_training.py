@@ -88,7 +88,7 @@ def test_held_out_exemplars_are_never_drawn(tmp_path):
     run = new_space(tmp_path / "run", members=6, held_out=["1.png", "4.png"])
     task, generator, drawn = TextureSpace(run, CPU), torch.Generator().manual_seed(0), set()
     for _ in range(40):
-        batch = task.draw(generator)
+        batch = task.draw(0, generator)
         drawn |= {*numbers(batch.real), *numbers(batch.inputs[-1])}
     assert drawn == {0, 2, 3, 5}
     assert set(numbers(task.probe().inputs[-1])) <= drawn
@@ -111,7 +111,7 @@ def test_a_batch_is_of_as_many_exemplars_as_it_can_hold_and_the_encoder_sees_tho
     task = TextureSpace(new_space(tmp_path / "run", members=count, batch=4, group=group), CPU)
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
-        (_, points, seen), real, _ = task.draw(generator)
+        (_, points, seen), real, _ = task.draw(0, generator)
         assert len(points) == len(real) == 4
         assert seen.shape == (4 // group, 3, 128, 128)
         assert numbers(real) == [number for number in numbers(seen) for _ in range(group)]
@@ -120,7 +120,7 @@ def test_a_batch_is_of_as_many_exemplars_as_it_can_hold_and_the_encoder_sees_tho
 
 def test_the_encoder_and_the_critic_see_different_patches_of_an_exemplar(tmp_path):
     task = TextureSpace(new_space(tmp_path / "run", patch=128), CPU)
-    (*_, seen), real, _ = task.draw(torch.Generator().manual_seed(0))
+    (*_, seen), real, _ = task.draw(0, torch.Generator().manual_seed(0))
     assert not torch.equal(seen, real)
 
 

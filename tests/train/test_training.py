@@ -24,6 +24,7 @@ from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import Budget, preset
+from solidgrain.train.task import make_task
 from tests.train.conftest import blotches
 
 TINY = {
@@ -105,6 +106,27 @@ def test_resuming_is_exact_in_bfloat16_and_on_two_threads_as_well(tmp_path, phot
             train(open_run(tmp_path / name), Budget(iterations=iterations), CPU)
     assert losses(tmp_path / "parts") == losses(tmp_path / "whole")
     assert_same_checkpoint(tmp_path / "parts", tmp_path / "whole")
+
+
+def test_later_patches_are_larger_where_the_exemplar_has_room(tmp_path, photograph):
+    """And a run resumes across the change to the same numbers."""
+    changes = {"later_patch": 40, "later_from": 4}
+    whole, halves = (new_run(tmp_path / name, photograph, **changes) for name in ("whole", "halves"))
+    assert min(whole.exemplar.shape[:2]) == 80
+    task, sizes = make_task(whole, CPU), []
+    for iteration in (0, 3, 4):
+        (_, points), real, _ = task.draw(iteration, torch.Generator().manual_seed(0))
+        assert points.shape[1] == real.shape[2] * real.shape[3]
+        sizes.append(real.shape[2])
+    assert sizes == [32, 32, 40]
+    train(whole, Budget(iterations=6), CPU)
+    train(halves, Budget(iterations=3), CPU)
+    train(halves, Budget(iterations=6), CPU)
+    assert losses(whole.folder) == losses(halves.folder)
+    small = new_run(tmp_path / "small", photograph, later_patch=41, later_from=0)
+    assert small.settings_at(9).patch == 32
+    card = (export_run(whole.folder, tmp_path / "bundle") / "card.md").read_text()
+    assert "2 of 32², 40² from iteration 4 on, pixels per iteration" in card
 
 
 def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, photograph):
