@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="photograph's pixels per exemplar pixel; patches see more of it (1)",
     )
-    add("--patch", type=parse_positive, metavar="PX", help="pixels along each side of a patch, at least 32")
+    add("--patch", type=parse_positive, metavar="PX", help="pixels along each side of a patch, at least 32, all along")
     add("--batch", type=parse_positive, metavar="N", help="patches per iteration")
     add("--seed", type=parse_seed, metavar="N", help="of all randomness (0)")
     add("--precision", choices=("auto", "float32", "bfloat16"), help="of plain forward passes (auto)")

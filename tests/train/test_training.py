@@ -245,6 +245,7 @@ def test_the_command_line_trains_and_exports(solidgrain, tmp_path, photograph):
     )  # fmt: skip
     assert outcome.code == 0, outcome.err
     assert "solidgrain export" in outcome.err
+    assert open_run(tmp_path / "run").settings.later_patch == 0  # the flag's side all along
     assert solidgrain("export", tmp_path / "run", "--out", tmp_path / "bundle").code == 0
     assert solidgrain("bake", tmp_path / "bundle", "--size", 4, "--out", tmp_path / "a.npy").code == 0
 
