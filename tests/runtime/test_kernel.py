@@ -415,8 +415,9 @@ def test_a_forked_process_evaluates_as_well(toy_folder):
 @pytest.mark.parametrize("provider", ["auto", "cpu"])
 def test_an_interrupt_is_answered_at_once(toy_folder, provider):
     program = f"""
-import time
+import signal, time
 from solidgrain.runtime import load
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it, and so would its children
 texture = load({str(toy_folder)!r}, provider={provider!r})
 texture.grid((1, 8, 8))
 print("ready", flush=True)
