@@ -41,9 +41,10 @@ def write_card(name: str, training: dict[str, Any]) -> str:
 
 def _sides(training: dict[str, Any]) -> str:
     """How large patches were at first, and later if they grew."""
-    settings, last = training["settings"], training.get("last_patch")
-    grew = f", {last}² from iteration {settings.get('later_from')} on," if last not in (None, settings["patch"]) else ""
-    return f"{settings['patch']}²{grew}"
+    settings = training["settings"]
+    first = settings["patch"]
+    last = training.get("last_patch", first)  # which earlier versions and spaces do not say
+    return f"{first}²" if last == first else f"{first}², {last}² from iteration {settings['later_from']} on,"
 
 
 def _reduced(entry: dict[str, Any]) -> str:
