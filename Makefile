@@ -59,7 +59,7 @@ bench: install
 bench-bake: install
 	$(BIN)/python -m tests.bench.bakes --large
 
-# Hours unattended, and again after a kill: finished cells are kept (docs/training.md says how long they take).
+# Hours unattended, and again after a kill: finished cells are kept (docs/experiments.md says how long they take).
 MINUTES ?= 20
 paper-table: install
 	$(BIN)/python -m tests.bench.paper_table --minutes $(MINUTES) --resume

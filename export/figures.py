@@ -29,17 +29,25 @@ class Figures:
 
 def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
     rows = []
-    column = (f"exemplar {evaluation.turn}",) if evaluation.turned else ()  # what earlier versions found has none
+    turned = (f"exemplar {evaluation.turn}",) if evaluation.turned else ()  # what earlier versions found has none
+    among = ("slices from each other",) if evaluation.among else ()  # nor these; nor has a single slice
     for name, floor in evaluation.floor.items():
         spreads = (evaluation.axis[name], evaluation.oblique[name])
-        turned = (f"{evaluation.turned[name]:.2f}" for _ in column)
-        rows.append((name, f"{floor:.4g}", *turned, *(f"{mean:.2f} ± {deviation:.2f}" for mean, deviation in spreads)))
+        rows.append(
+            (
+                name,
+                f"{floor:.4g}",
+                *(f"{evaluation.turned[name]:.2f}" for _ in turned),
+                *(f"{mean:.2f} ± {deviation:.2f}" for mean, deviation in spreads),
+                *(f"{evaluation.among[name]:.2f}" for _ in among),
+            )
+        )
     uneven = evaluation.nonstationarity > NONSTATIONARY
     change = f" The exemplar changes across itself (nonstationarity {evaluation.nonstationarity:.2f}, above {NONSTATIONARY})."
     return Figures(
         f"Distances to the exemplar over its own floor, mean ± standard deviation over {evaluation.slices} slices of "
         f"{evaluation.crop}² pixels, through the runtime:",
-        ("measure", "floor", *column, "axis-aligned slices", "oblique slices"),
+        ("measure", "floor", *turned, "axis-aligned slices", "oblique slices", *among),
         rows,
         f"Copying: patches are {copying.ratio:.2f} times as far from the exemplar as its halves are from each other, and "
         f"{100 * copying.closer:.1f} % of {copying.patches} come nearer than 99 % of those do "

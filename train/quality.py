@@ -15,7 +15,7 @@ Images here are tensors [1, 3, H, W] in [0, 1].
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -52,6 +52,7 @@ class Evaluation:
     turned: Measures = field(default_factory=dict)  # the exemplar itself, as `turn` says: far above 1 where it has a direction
     nonstationarity: float = 0.0  # of the exemplar
     grain: str = "none"  # the image axis about which slices turn
+    among: Measures = field(default_factory=dict)  # oblique slices from each other: below 1 they vary less than the exemplar
 
     @property
     def turn(self) -> str:
@@ -81,25 +82,32 @@ def evaluate(
     others = [measure.statistics(turned_as_slices_are(square, grain)) for square in squares]
     turned = _mean(measure.distances(a, b) for i, a in enumerate(crops) for j, b in enumerate(others) if i != j)
 
-    def ratios(rotation_of: Callable[[int, torch.Generator], Tensor]) -> dict[str, tuple[float, float]]:
-        measured = []
-        for seed in range(slices):
-            generator = torch.Generator().manual_seed(seed)
-            rotation = rotation_of(seed, generator)
-            picture = measure.statistics(as_image(cut(sample, size, rotation, seed, random_place(generator))))
-            measured.append(_mean(measure.distances(crop, picture) for crop in crops))
-        return {name: _spread([one[name] / floor[name] for one in measured]) for name in floor}
+    def pictures(rotation_of: Callable[[int, torch.Generator], Tensor]) -> Iterator[Statistics]:
+        return map(measure.statistics, take_slices(sample, size, slices, rotation_of))
 
+    axis, _ = _compared(measure, pictures(lambda seed, generator: axis_rotation(seed, grain)), crops, floor)
+    oblique, among = _compared(measure, pictures(lambda seed, generator: oblique_rotation(generator, grain)), crops, floor)
     return Evaluation(
         crop=size,
         slices=slices,
         floor=floor,
-        axis=ratios(lambda seed, generator: axis_rotation(seed, grain)),
-        oblique=ratios(lambda seed, generator: oblique_rotation(generator, grain)),
+        axis=axis,
+        oblique=oblique,
         turned={name: turned[name] / floor[name] for name in floor},
         nonstationarity=nonstationarity(exemplar),
         grain=grain,
+        among=among,
     )
+
+
+def take_slices(
+    sample: Sample, size: int, count: int, rotation_of: Callable[[int, torch.Generator], Tensor]
+) -> Iterator[Tensor]:
+    """Slices of `size`² pixels, each of another instance, rotated as a seed and its random stream say."""
+    for seed in range(count):
+        generator = torch.Generator().manual_seed(seed)
+        rotation = rotation_of(seed, generator)
+        yield as_image(cut(sample, size, rotation, seed, random_place(generator)))
 
 
 def turned_as_slices_are(image: Tensor, grain: str) -> Tensor:
@@ -171,6 +179,23 @@ class Measure:
         if exemplar.inception and other.inception:
             measures["sifid"] = _frechet(exemplar.inception, other.inception)
         return measures
+
+
+def _compared(
+    measure: Measure, pictures: Iterable[Statistics], crops: list[Statistics], floor: Measures
+) -> tuple[dict[str, tuple[float, float]], Measures]:
+    """How far pictures are from an exemplar's crops, and each from the one before it, over a floor.
+
+    One picture at a time: the statistics of a hundred do not fit in memory.
+    """
+    to_crops, to_last, last = [], [], None
+    for picture in pictures:
+        to_crops.append(_mean(measure.distances(crop, picture) for crop in crops))
+        if last is not None:
+            to_last.append(measure.distances(last, picture))
+        last = picture
+    among = {name: value / floor[name] for name, value in _mean(to_last).items()} if to_last else {}
+    return {name: _spread([one[name] / floor[name] for one in to_crops]) for name in floor}, among
 
 
 def _moments(features: Tensor) -> tuple[Tensor, Tensor]:

@@ -35,6 +35,17 @@ def test_crops_of_the_exemplar_score_about_one():
         assert 0.4 < evaluation.axis[name][0] < 1.6
 
 
+def test_slices_from_each_other_tell_a_texture_that_varies_from_one_that_repeats_itself():
+    varied = evaluate(EXEMPLAR, resampled, slices=4)
+    assert 0.3 < varied.among["gram"] < 1.6
+    repeated = evaluate(EXEMPLAR, lambda points, seed: resampled(points, 0), slices=2)
+    assert repeated.among == pytest.approx(dict.fromkeys(repeated.floor, 0.0), abs=1e-3)
+    single = evaluate(EXEMPLAR, resampled, slices=1)
+    assert single.among == {}
+    headers = [make_figures(one, Copying(256, 0.1, 1.25, 0.004)).header for one in (varied, single)]
+    assert headers[0] == (*headers[1], "slices from each other")
+
+
 @pytest.mark.parametrize("side", [64, 72, 80, 88, 136])
 def test_exemplars_of_any_size_are_measured(side):
     """Whatever VGG's pyramid leaves of their crops."""
