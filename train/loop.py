@@ -59,7 +59,8 @@ class Trainer:
         self.critic = critic.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.judge = make_judge(self.settings, self.critic, device)
         self.sampler = self.task.make_model(self.generator)
-        self.task.begin(self.sampler)
+        if not (run.folder / CHECKPOINT).exists():  # which brings weights of its own
+            self.task.begin(self.sampler)
         self.average = copy.deepcopy(self.sampler).requires_grad_(False)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), betas=(0.5, 0.999), fused=True)
         self.sampler_optimiser = torch.optim.Adam(parameter_groups(self.sampler, self.settings), betas=(0.5, 0.999), fused=True)
