@@ -62,7 +62,7 @@ bench-bake: install
 # Hours unattended, and again after a kill: finished cells are kept (docs/experiments.md says how long they take).
 MINUTES ?= 20
 paper-table: install
-	$(BIN)/python -m tests.bench.paper_table --minutes $(MINUTES) --resume
+	$(BIN)/python -m tests.bench.paper_table --minutes $(MINUTES) --resume $(FLAGS)
 
 # What each switch of the recipe is worth, or with FLAGS="--only fast --exemplar PHOTO --largest 2048 --marks 5,15,30,60" its figures.
 recipe-table: install
@@ -75,7 +75,7 @@ space-table: install
 	$(BIN)/python -m tests.bench.space_table --bundle $(BUNDLE) --seconds $(SECONDS) --resume $(FLAGS)
 
 ground-truth: install
-	$(BIN)/python -m tests.bench.ground_truth --minutes $(MINUTES) --resume
+	$(BIN)/python -m tests.bench.ground_truth --minutes $(MINUTES) --resume $(FLAGS)
 
 # Figures and pictures of the embedded textures. FLAGS="--only granite" measures one of them, FLAGS=--resume those that are new.
 textures: install

@@ -28,7 +28,7 @@ from solidgrain.train.companion import Companion
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
 from solidgrain.train.loop import use_bfloat16
-from solidgrain.train.losses import gram_difference, gram_matrices, mean_grams
+from solidgrain.train.losses import gram_difference, mean_gram, mean_grams
 from solidgrain.train.noise import draw_tables, look_up
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, draw_slices
@@ -209,7 +209,7 @@ class Adaptation:
             images = rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
             activations = self.features.activations(self.stretch(images))
         pairs = zip(self.target, activations, strict=True)
-        terms = [gram_difference(wanted, gram_matrices(of_layer, 1), self.features.relative) for wanted, of_layer in pairs]
+        terms = [gram_difference(wanted, mean_gram(of_layer), self.features.relative) for wanted, of_layer in pairs]
         return torch.stack(terms).mean()
 
     @torch.no_grad()

@@ -305,8 +305,6 @@ def make_settings(arguments: argparse.Namespace) -> Settings:
         raise UsageError(f"--patch {arguments.patch}: expected at least {SMALLEST_PATCH}")
     kind = " space" if arguments.space else ""
     settings = vary(preset((arguments.preset or "fast") + kind, **changes), arguments.variant or "paper")
-    if settings.batch % settings.group:
-        raise UsageError(f"--batch {settings.batch}: expected a multiple of {settings.group}, the patches per exemplar")
     if settings.style_features == "vgg":
         find_weights()  # before there is a run directory
     return settings

@@ -26,10 +26,6 @@ class Stretch(NamedTuple):
     def __call__(self, images: Tensor) -> Tensor:
         return self.middle + self.gain * (images - self.middle)
 
-    def repeated(self, times: int) -> Stretch:
-        """Each for that many images in a row."""
-        return Stretch(*(part.repeat_interleave(times, dim=0) for part in self))
-
 
 def stretch_to(contrast: float, exemplar: FloatArray, device: torch.device) -> Stretch:
     """What brings an exemplar [H, W, 3] to a contrast; 0 for as it is."""

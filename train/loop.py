@@ -146,7 +146,7 @@ class Trainer:
             on_fake, of_fake = self.judge(fake)
             with torch.no_grad():
                 _, of_real = self.judge(real)
-        style = style_loss(of_real, of_fake, settings.gram_groups, settings.compares_relatively, settings.gram_energy)
+        style = style_loss(of_real, of_fake, settings.compares_relatively, settings.gram_energy)
         return style, on_fake.float().mean()
 
     def _set_rates(self) -> None:

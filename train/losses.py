@@ -41,19 +41,17 @@ def gradient_penalty(critic: Critic, real: Tensor, fake: Tensor, generator: torc
     return penalty
 
 
-def style_loss(
-    real: Sequence[Tensor], fake: Sequence[Tensor], groups: int, relative: bool = False, energy: bool = False
-) -> Tensor:
+def style_loss(real: Sequence[Tensor], fake: Sequence[Tensor], relative: bool = False, energy: bool = False) -> Tensor:
     """L_style of Eq. 4: the mean over layers of the mean absolute difference of Gram matrices.
 
     The Gram matrix is F F^T / pixels, the normalisation of the authors' code; the equation's 1 / (4 N² M²) differs from it
-    by a factor per layer. The batch is so many groups of consecutive patches, each of one exemplar: matrices are averaged
-    within a group before they are compared. `relative` differences are those over the mean absolute entry of the real
-    matrix: the scale of the features then does not matter. With `energy` all groups are of one exemplar (`gram_energy`).
+    by a factor per layer. Each slice is compared with the patch in its place: of the same exemplar, or for `energy` all are of
+    one (`gram_energy`). `relative` differences are those over the mean absolute entry of the real matrix: the scale of the
+    features then does not matter.
     """
     terms = []
     for of_real, of_fake in zip(real, fake, strict=True):
-        wanted, found = (gram_matrices(activations, groups) for activations in (of_real, of_fake))
+        wanted, found = (gram_matrices(activations) for activations in (of_real, of_fake))
         if energy:
             terms.append(gram_energy(wanted, found, relative))
         else:
@@ -62,7 +60,7 @@ def style_loss(
 
 
 def gram_energy(wanted: Tensor, found: Tensor, relative: bool) -> Tensor:
-    """How far apart two sets of Gram matrices [G, C, C] are, as distributions: E|W - F| - E|F - F'| / 2.
+    """How far apart two sets of Gram matrices [B, C, C] are, as distributions: E|W - F| - E|F - F'| / 2.
 
     Patches of one exemplar are not alike, and a slice is compared with whichever was drawn. |W - F| alone is least where every
     F is the median of all W: what only some patches show becomes rare. Less half of what slices differ from each other, it is
@@ -77,19 +75,24 @@ def gram_energy(wanted: Tensor, found: Tensor, relative: bool) -> Tensor:
 
 
 def gram_difference(wanted: Tensor, found: Tensor, relative: bool) -> Tensor:
-    """Mean absolute differences [groups] of Gram matrices [groups, C, C], over those wanted if `relative`."""
+    """Mean absolute differences [B] of Gram matrices [B, C, C], over those wanted if `relative`."""
     difference = (wanted - found).abs().mean((1, 2))
     return difference / wanted.abs().mean((1, 2)) if relative else difference
 
 
 def mean_grams(batches: Iterable[Sequence[Tensor]]) -> list[Tensor]:
     """The activations of several batches, by layer -> each layer's mean Gram matrix [1, C, C]."""
-    of_batches = [[gram_matrices(of_layer, 1) for of_layer in activations] for activations in batches]
+    of_batches = [[mean_gram(of_layer) for of_layer in activations] for activations in batches]
     return [torch.stack(of_layer).mean(0) for of_layer in zip(*of_batches, strict=True)]
 
 
-def gram_matrices(activations: Tensor, groups: int) -> Tensor:
-    """Activations [B, C, H, W] -> the mean Gram matrix of each group [groups, C, C]; float32 whatever came in."""
+def mean_gram(activations: Tensor) -> Tensor:
+    """Activations [B, C, H, W] -> the mean of the batch's Gram matrices [1, C, C]."""
+    return gram_matrices(activations).mean(0, keepdim=True)
+
+
+def gram_matrices(activations: Tensor) -> Tensor:
+    """Activations [B, C, H, W] -> the Gram matrix of each image [B, C, C]; float32 whatever came in."""
     flat = activations.float().flatten(2)
     gram: Tensor = flat @ flat.transpose(1, 2) / flat.shape[2]
-    return gram.reshape(groups, -1, *gram.shape[1:]).mean(1)
+    return gram

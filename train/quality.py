@@ -160,8 +160,8 @@ class Measure:
         levels = [F.avg_pool2d(image, factor) for factor in (1, 2, 4)]
         return Statistics(
             moments=[_moments(F.avg_pool2d(features[layer], 2)) for layer in FRECHET_LAYERS],
-            grams=[gram_matrices(features[layer], 1) for layer in GRAM_LAYERS if layer < len(features)],
-            coarse_grams=[gram_matrices(coarse[layer], 1) for layer in GRAM_LAYERS if layer < len(coarse)],
+            grams=[gram_matrices(features[layer]) for layer in GRAM_LAYERS if layer < len(features)],
+            coarse_grams=[gram_matrices(coarse[layer]) for layer in GRAM_LAYERS if layer < len(coarse)],
             patches=[_projections(F.unfold(level, 7)[0].T, 256) for level in levels],
             colors=_projections(image.flatten(2)[0].T, 32),
             inception=_moments(self.inception.features(image)) if self.inception else None,

@@ -49,7 +49,6 @@ class Settings:
     penalty: float = 10.0  # lambda, weight of the gradient penalty
     penalty_every: int = 4  # iterations between penalties, each weighted that much more (lazy regularisation, StyleGAN2)
     drift: float = 0.001  # weight of E[D(r)^2] (gramgan/main.py; not in the paper)
-    pooled_gram: bool = False  # compare the mean Gram matrix of all patches of an exemplar, else one of each patch
     relative_gram: bool = False  # differences of Gram matrices over their size, else as they are
     gram_energy: bool = False  # L_style is an energy distance: slices differ among themselves as the exemplar's patches do
 
@@ -57,7 +56,6 @@ class Settings:
     latent: int = 0  # length of z; 0 for a single exemplar
     color_moments: bool = False  # four numbers of z are the patch's mean colour and contrast, else all are learned
     encoded_patch: int = 128  # pixels along each side of the patch that E sees
-    group: int = 1  # consecutive patches of a batch that show one exemplar
 
     # Optimisation
     critic_contrast: float = 0.0  # root mean square to which D sees faint exemplars stretched; 0: as they are
@@ -88,13 +86,6 @@ class Settings:
     def compares_relatively(self) -> bool:
         """Whether L_style divides by the size of the real Gram matrix; with VGG's features always, which nobody scales."""
         return self.relative_gram or self.style_features == "vgg"
-
-    @property
-    def gram_groups(self) -> int:
-        """Groups of patches whose Gram matrices are compared: all of an exemplar's, or each patch alone."""
-        if not self.pooled_gram:
-            return self.batch
-        return self.batch // self.group if self.latent else 1
 
 
 @dataclass(frozen=True)
@@ -167,7 +158,6 @@ PRESETS = {
         sampler_start="",
         later_patch=0,
         color_moments=True,
-        pooled_gram=True,
         gram_energy=False,
         sampler_rate=1e-3,
         sampler_half_life=6000.0,
@@ -176,7 +166,7 @@ PRESETS = {
     ),
     "paper space": replace(PAPER, **SPACE, octave_span=15.5),  # 2^(i/2)
 }
-RETIRED = {"keep_best"}  # settings of earlier versions: the result is the last average now
+RETIRED = {"keep_best", "pooled_gram", "group"}  # settings of earlier versions
 PRESET_ITERATIONS = {"fast": 1200, "paper": 100_000, "fast space": 30_000, "paper space": 300_000}
 
 

@@ -138,11 +138,11 @@ class TextureSpace:
         settings, device = self.settings, self.device
         tables, points = self.noise.draw(generator), draw_slices(settings, generator)
         order = torch.randperm(len(self.members), generator=generator, device=device).tolist()
-        places = [order[k % len(order)] for k in range(settings.batch // settings.group)]
+        places = [order[k % len(order)] for k in range(settings.batch)]
         chosen = [self.members[place] for place in places]
         seen = [collection.draw_patches(one, settings.encoded_patch, 1, settings, generator) for one in chosen]
-        real = [collection.draw_patches(one, settings.patch, settings.group, settings, generator) for one in chosen]
-        stretch = together([self.stretches[place] for place in places]).repeated(settings.group)
+        real = [collection.draw_patches(one, settings.patch, 1, settings, generator) for one in chosen]
+        stretch = together([self.stretches[place] for place in places])
         return Batch((tables, points, torch.cat(seen)), torch.cat(real).contiguous(memory_format=torch.channels_last), stretch)
 
     def probe(self) -> Probe:

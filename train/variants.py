@@ -10,8 +10,8 @@
 The paper ran Henzler et al.'s own model; `henzler` is what the paper says sets it apart, in a sampler of our size, with our
 optimiser and the L1 distance of Eq. 4. For GAN+VGG the paper "chose the hyperparameters to approximately result in the same
 weighting as ours": here α and β stay, and VGG's L_style is taken relative to the exemplar's Gram matrices. Between batches of
-the exemplar's own patches it is then 0.09 to 0.12, where D's ends near 0.13 in a good run. The VGG is VGG-16 (the paper
-names VGG-19), up to conv4_1.
+the exemplar's own patches it is then 0.09 to 0.12, where D's, compared likewise, ended near 0.13 in a good
+run. The VGG is VGG-16 (the paper names VGG-19), up to conv4_1.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 python -m tests.bench.recipe --marks 2,4,6 --threads 1 --out FOLDER [--only ROW] [--exemplar PHOTO] [--resume]
 
 Each row is the preset with one setting, or one group of them, as the paper has it. Every row is trained on the same exemplars
-with the same seeds, and measured after so many minutes of training: VGG-Fréchet and Gram distance of oblique slices over the
-exemplar's floor, the geometric mean over exemplars and seeds, and the worst. For each mark there follow the preset's figures of
-every exemplar by every measure; table.json has everything.
+with the same seeds, and measured after so many minutes of training, or with `--by iterations` at the same iterations on any
+machine: VGG-Fréchet and Gram distance of oblique slices over the exemplar's floor, the geometric mean over exemplars and seeds,
+and the worst. For each mark there follow the preset's figures of every exemplar by every measure; table.json has everything.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DEFAULTS = [  # the embedded critic, which FAST starts from, has seen none of th
     cells.EXEMPLARS / "stone128" / "Terrazzo006.png",
     cells.EXEMPLARS / "stone128" / "Marble018.png",
 ]
-MARKS = [2.0, 4.0, 6.0]  # minutes
+MARKS = [2.0, 4.0, 6.0]
 LARGEST = 256  # pixels: of larger photographs the middle
 SMALLEST = 128
 SHOWN = ("vgg_frechet", "gram")
@@ -65,7 +65,6 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "random-rgb": ("both of these", as_paper("critic_start", "principal_colors")),
     "lazy": ("penalty every iteration", as_paper("penalty_every")),
     "gram": ("Gram differences as they are", as_paper("relative_gram")),
-    "pooled": ("Gram matrices of the batch's mean", replace(FAST, pooled_gram=True)),
     "octave-rate": ("T_i as fast as the rest", as_paper("octave_rate")),
     "fresh-noise": ("fresh noise tables", as_paper("shared_noise")),
     "critic-rate": ("D learns twice as fast", as_paper("critic_rate", "critic_rate_floor")),
@@ -87,25 +86,24 @@ def main(argv: Sequence[str] | None = None) -> None:
     chosen = arguments.exemplar if arguments.exemplar or arguments.anisotropic else DEFAULTS
     exemplars = {path.stem: middle(path, arguments.largest) for path in chosen}
     grained = {path.stem: middle(path, arguments.largest) for path in arguments.anisotropic}
-    device, _ = cells.prepare(arguments, marks=arguments.marks, largest=arguments.largest)
+    device, _ = cells.prepare(arguments, marks=arguments.marks, by=arguments.by, largest=arguments.largest)
     for seed in range(arguments.seeds):
         for row in arguments.only or ROWS:
             for name, exemplar in (exemplars | grained).items():
                 settings = replace(ROWS[row][1], seed=seed)
                 settings = with_grain(settings, "auto" if name in grained else None, exemplar)
                 folder = arguments.out / row / f"{name}-{seed}"
-                for minutes in arguments.marks:
-                    finish_mark(folder, settings, exemplar, minutes, arguments.slices, device)
-                    write_results(arguments.out, arguments.marks)
+                for mark in arguments.marks:
+                    finish_mark(folder, settings, exemplar, mark, arguments.by, arguments.slices, device)
+                    write_results(arguments.out, arguments.marks, arguments.by)
     print((arguments.out / "table.md").read_text("utf-8"))
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = cells.arguments_of(__doc__.splitlines()[0], Path("build/recipe"), slices=8)
     add = parser.add_argument
-    add(
-        "--marks", type=parse_marks, default=MARKS, metavar="M,M,...", help="minutes of training after which to measure (2,4,6)"
-    )
+    add("--marks", type=parse_marks, default=MARKS, metavar="M,M,...", help="when to measure (2,4,6)")
+    add("--by", choices=("minutes", "iterations"), default="minutes", help="what marks count (minutes)")
     add("--seeds", type=parse_positive, default=2, metavar="N", help="trainings of each row on each exemplar (2)")
     add("--only", action="append", default=[], choices=ROWS, metavar="ROW", help=f"of {', '.join(ROWS)} (all)")
     add("--exemplar", action="append", type=Path, default=[], metavar="PHOTO", help="instead of the three; may be repeated")
@@ -128,25 +126,26 @@ def middle(path: Path, largest: int) -> FloatArray:
 
 
 def finish_mark(
-    folder: Path, settings: Settings, exemplar: FloatArray, minutes: float, slices: int, device: torch.device
+    folder: Path, settings: Settings, exemplar: FloatArray, mark: float, by: str, slices: int, device: torch.device
 ) -> None:
     """Train one row on one exemplar until a mark, and measure, unless that was done before."""
-    result = folder.with_name(f"{folder.name}-{minutes:g}.json")
+    result = folder.with_name(f"{folder.name}-{mark:g}.json")
     if result.exists():
         return
-    cells.say(f"{folder.parent.name}, {folder.name}: until minute {minutes:g}")
-    run = cells.trained(folder, settings, exemplar, Budget(minutes=minutes), device)
-    found: dict[str, Any] = {"exemplar": folder.name, "mark": minutes, **run.facts, "settings": asdict(settings)}
+    cells.say(f"{folder.parent.name}, {folder.name}: {mark:g} {by}")
+    budget = Budget(minutes=mark) if by == "minutes" else Budget(iterations=round(mark))
+    run = cells.trained(folder, settings, exemplar, budget, device)
+    found: dict[str, Any] = {"exemplar": folder.name, "mark": mark, **run.facts, "settings": asdict(settings)}
     if run.iterations:
         found["quality"] = asdict(evaluate(exemplar, cells.sampling(run.run, device), slices, settings.grain))
     cells.keep(result, found)
 
 
-def write_results(out: Path, marks: Sequence[float]) -> None:
+def write_results(out: Path, marks: Sequence[float], by: str) -> None:
     """table.md and table.json of what is finished."""
     found = {row: measured for row in ROWS if (measured := collected(out / row))}
     cells.keep(out / "table.json", found)
-    tables = [rows_table(found, marks), *(exemplars_table(found.get("fast", {}), mark) for mark in marks)]
+    tables = [rows_table(found, marks, by), *(exemplars_table(found.get("fast", {}), mark, by) for mark in marks)]
     with replacing(out / "table.md") as file:
         file.write("\n\n".join(tables).encode() + b"\n")
 
@@ -156,25 +155,27 @@ def collected(folder: Path) -> dict[str, dict[str, Any]]:
     return {path.stem: cell for path in sorted(folder.glob("*.json")) if (cell := cells.kept(path))}
 
 
-def rows_table(found: Found, marks: Sequence[float]) -> str:
+def rows_table(found: Found, marks: Sequence[float], by: str) -> str:
     """One line per row, in Markdown."""
-    lines = titles("", [f"{name}, {mark:g} min" for name in SHOWN for mark in marks] + ["iterations"])
+    lines = titles("", [f"{name}, {mark:g} {by}" for name in SHOWN for mark in marks] + ["iterations", "seconds each"])
     for row, measured in found.items():
         figures = [over_all(values(measured, "oblique", name, mark)) for name in SHOWN for mark in marks]
         longest = max(cell["mark"] for cell in measured.values())
-        iterations = np.mean([cell["iterations"] for cell in measured.values() if cell["mark"] == longest])
-        lines.append(f"| {ROWS[row][0]} | {' | '.join(figures)} | {iterations:.0f} |")
+        lengths = [(cell["iterations"], cell["minutes"]) for cell in measured.values() if cell["mark"] == longest]
+        iterations, minutes = np.mean(lengths, 0)
+        seconds = f"{60 * minutes / iterations:.2f}" if iterations else "–"
+        lines.append(f"| {ROWS[row][0]} | {' | '.join(figures)} | {iterations:.0f} | {seconds} |")
     return "\n".join(lines)
 
 
-def exemplars_table(measured: Mapping[str, Mapping[str, Any]], mark: float) -> str:
+def exemplars_table(measured: Mapping[str, Mapping[str, Any]], mark: float, by: str) -> str:
     """The preset's figures at a mark, one line per exemplar and seed: axis-aligned / oblique slices; their median and worst.
 
     Last, VGG-Fréchet of the exemplar itself, turned by 90°, or with a grain mirrored across it.
     """
     finished = [cell for cell in measured.values() if cell["mark"] == mark and "quality" in cell]
     names = list(finished[0]["quality"]["floor"]) if finished else []
-    lines = titles(f"the preset, {mark:g} min: axis-aligned / oblique", ["iterations", *names, "itself, turned"])
+    lines = titles(f"the preset, {mark:g} {by}: axis-aligned / oblique", ["iterations", *names, "itself, turned"])
     for cell in finished:
         turned = cell["quality"]["turned"][SHOWN[0]]
         pairs = [pair(cell["quality"], name) for name in names]

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from solidgrain.train.cuts import Sample, as_image, axis_rotation, cut, oblique_rotation, random_place
 from solidgrain.train.exemplar import FloatArray
-from solidgrain.train.likelihood import BANDWIDTHS, log_likelihoods, take_patches
 from solidgrain.train.quality import Measure, Statistics, disjoint_crops
+from tests.bench.likelihood import BANDWIDTHS, log_likelihoods, take_patches
 
 KINDS = ("oblique", "axis")  # orientations of slices, reported apart
 FEWEST, MOST = 4, 8  # crops of truth

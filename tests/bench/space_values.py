@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from solidgrain.train.likelihood import BANDWIDTHS
 from tests.bench import cells
+from tests.bench.likelihood import BANDWIDTHS
 from tests.bench.signed_rank import signed_rank
 from tests.bench.space_measure import KERNELS, KINDS
 from tests.bench.space_methods import TITLES

@@ -47,9 +47,9 @@ def test_an_exemplar_of_one_colour_is_no_division_by_zero():
 
 
 def test_each_image_of_a_batch_has_its_own():
-    pair = together([stretch_to(0.15, faint(factor), CPU) for factor in (0.1, 0.3)]).repeated(2)
-    images = torch.cat([image(faint(factor)) for factor in (0.1, 0.1, 0.3, 0.3)])
-    torch.testing.assert_close(deviation(pair(images)), torch.full((4,), 0.15), rtol=1e-3, atol=0)
+    pair = together([stretch_to(0.15, faint(factor), CPU) for factor in (0.1, 0.3)])
+    images = torch.cat([image(faint(factor)) for factor in (0.1, 0.3)])
+    torch.testing.assert_close(deviation(pair(images)), torch.full((2,), 0.15), rtol=1e-3, atol=0)
 
 
 def test_slices_and_patches_of_a_training_are_stretched_alike(tmp_path, photograph):

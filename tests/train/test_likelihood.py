@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from solidgrain.train import likelihood
-from solidgrain.train.likelihood import BANDWIDTHS, log_likelihoods, take_patches
+from tests.bench import likelihood
+from tests.bench.likelihood import BANDWIDTHS, log_likelihoods, take_patches
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from solidgrain.train.critic import Critic
-from solidgrain.train.losses import gradient_penalty, gram_matrices, style_loss
+from solidgrain.train.losses import gradient_penalty, gram_matrices, mean_gram, style_loss
 from solidgrain.train.noise import draw_tables, look_up, shift_tables
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import FAST, PAPER, preset, rate
@@ -114,38 +114,33 @@ def test_penalty_is_zero_for_a_critic_of_slope_one():
 def test_gram_matrix_is_the_mean_product_of_channels():
     activations = torch.randn(2, 5, 4, 6, generator=generator())
     expected = torch.einsum("bihw,bjhw->bij", activations, activations) / 24
-    torch.testing.assert_close(gram_matrices(activations, groups=len(activations)), expected)
-    torch.testing.assert_close(gram_matrices(activations, groups=1)[0], expected.mean(0))
+    torch.testing.assert_close(gram_matrices(activations), expected)
+    torch.testing.assert_close(mean_gram(activations)[0], expected.mean(0))
 
 
 def test_style_loss_ignores_where_things_are():
     activations = torch.randn(2, 5, 8, 8, generator=generator())
-    assert style_loss([activations], [activations.roll(3, -1)], groups=1).item() == pytest.approx(0, abs=1e-6)
-    assert style_loss([activations], [activations * 1.5], groups=1).item() > 0.1
+    assert style_loss([activations], [activations.roll(3, -1)]).item() == pytest.approx(0, abs=1e-6)
+    assert style_loss([activations], [activations * 1.5]).item() > 0.1
 
 
-def test_style_loss_compares_exemplar_by_exemplar():
-    """Which patch of its exemplar stands where changes nothing; a patch under another exemplar's name does."""
-    real, fake = torch.randn(2, 6, 5, 8, 8, generator=generator()) * torch.arange(1, 7)[:, None, None, None]
-    together = style_loss([real], [fake], groups=3)
-    inside, between = [1, 0, 2, 3, 5, 4], [2, 1, 0, 3, 4, 5]
-    torch.testing.assert_close(style_loss([real], [fake[inside]], groups=3), together)
-    torch.testing.assert_close(style_loss([real[inside]], [fake], groups=3), together)
-    assert style_loss([real], [fake[between]], groups=3) > 1.1 * together
-    torch.testing.assert_close(style_loss([real], [fake[between]], groups=1), style_loss([real], [fake], groups=1))
-    one_by_one = [style_loss([real[k : k + 2]], [fake[k : k + 2]], groups=1) for k in (0, 2, 4)]
-    torch.testing.assert_close(torch.stack(one_by_one).mean(), together)
+def test_style_loss_compares_each_slice_with_the_patch_in_its_place():
+    """Only those of one exemplar stand side by side."""
+    real, fake = torch.randn(2, 3, 5, 8, 8, generator=generator()) * torch.arange(1, 4)[:, None, None, None]
+    one_by_one = [style_loss([real[k : k + 1]], [fake[k : k + 1]]) for k in range(3)]
+    torch.testing.assert_close(style_loss([real], [fake]), torch.stack(one_by_one).mean())
+    assert style_loss([real], [fake.roll(1, 0)]) > 1.1 * style_loss([real], [fake])
 
 
 def test_an_energy_distance_lets_slices_differ_as_the_exemplar_s_patches_do():
     """Of patches three of which are dark and one is bright, the median is dark: only the energy asks for bright ones."""
     brightness = torch.tensor([1.0, 1.0, 1.0, 3.0])
     mixed, dark = (values[:, None, None, None].expand(4, 1, 2, 2).clone() for values in (brightness, torch.ones(4)))
-    plain, energy = ([float(style_loss([mixed], [found], 4, energy=on)) for found in (mixed, dark)] for on in (False, True))
+    plain, energy = ([float(style_loss([mixed], [found], energy=on)) for found in (mixed, dark)] for on in (False, True))
     assert plain == [0, 2]  # patch by patch, in an order that slices do not know:
     unordered = [mixed[torch.tensor(order)] for order in ([0, 1, 2, 3], [3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2])]
-    assert np.mean([float(style_loss([mixed], [found], 4)) for found in unordered]) > plain[1]
-    assert [float(style_loss([mixed], [found], 4, energy=True)) for found in unordered] == [energy[0]] * 4
+    assert np.mean([float(style_loss([mixed], [found])) for found in unordered]) > plain[1]
+    assert [float(style_loss([mixed], [found], energy=True)) for found in unordered] == [energy[0]] * 4
     # Gram entries are 1 and 9: of 16 pairs (W, F) 6 differ, and 3 of 6 pairs (F, F'); of dark slices 4 of 16, and none
     assert energy == [pytest.approx(6 / 16 * 8 - 4 / 2), pytest.approx(4 / 16 * 8)]
     assert energy[0] < energy[1]
@@ -153,17 +148,10 @@ def test_an_energy_distance_lets_slices_differ_as_the_exemplar_s_patches_do():
 
 def test_an_energy_distance_of_one_patch_is_the_difference_and_may_be_relative():
     real, fake = torch.randn(2, 1, 5, 8, 8, generator=generator())
-    torch.testing.assert_close(style_loss([real], [fake], 1, energy=True), style_loss([real], [fake], 1))
+    torch.testing.assert_close(style_loss([real], [fake], energy=True), style_loss([real], [fake]))
     real, fake = torch.randn(2, 3, 5, 8, 8, generator=generator())
-    relative = style_loss([real], [fake], 3, relative=True, energy=True)
-    torch.testing.assert_close(style_loss([9 * real], [9 * fake], 3, relative=True, energy=True), relative)
-
-
-def test_gram_matrices_are_averaged_over_the_patches_of_one_exemplar_and_never_over_two():
-    assert preset("fast", batch=6).gram_groups == 6
-    assert preset("fast", batch=6, pooled_gram=True).gram_groups == 1
-    assert preset("fast space", batch=6, group=2).gram_groups == 3
-    assert preset("paper", batch=6).gram_groups == preset("paper space", batch=6).gram_groups == 6
+    relative = style_loss([real], [fake], relative=True, energy=True)
+    torch.testing.assert_close(style_loss([9 * real], [9 * fake], relative=True, energy=True), relative)
 
 
 def test_colours_are_float32_where_hidden_layers_are_not():
@@ -222,7 +210,7 @@ def test_rates_halve_down_to_their_floor_and_the_paper_s_are_constant():
 def test_the_paper_preset_is_the_paper_s():
     expected = {
         "octaves": 16, "width": 128, "resolution": 64, "octave_span": 15.0, "orthogonal_start": False,
-        "patch": 128, "batch": 16, "rotations": "euler", "transposed": False, "pooled_gram": False,
+        "patch": 128, "batch": 16, "rotations": "euler", "transposed": False,
         "alpha": 0.1, "beta": 1.0, "gram_energy": False, "penalty": 10.0, "penalty_every": 1, "drift": 0.001,
         "critic_rate": 2e-3, "sampler_rate": 5e-4,
     }  # fmt: skip

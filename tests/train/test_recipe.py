@@ -41,7 +41,6 @@ def differences(one, other):
 def test_every_departure_of_the_preset_from_the_paper_has_its_row_and_no_row_departs_further():
     changed = {row: differences(settings, FAST) for row, (_, settings) in recipe.ROWS.items()}
     assert [row for row in changed if not changed[row]] == ["fast"]
-    assert changed.pop("pooled") == {"pooled_gram"}  # a departure that was tried, and left
     assert set.union(*changed.values()) == differences(FAST, PAPER) - {"preset"}
     for row, names in changed.items():
         assert differences(recipe.ROWS[row][1], PAPER) == differences(FAST, PAPER) - names
@@ -53,8 +52,8 @@ def test_the_table_has_every_row_at_every_mark_and_a_second_start_changes_nothin
     lines = [line.split("|") for line in printed.splitlines() if line.startswith("|") and not line.startswith("|---")]
     assert [line[1].strip() for line in lines if line[1].strip()] == [
         *("the preset", "plain"),
-        *("the preset, 0.01 min: axis-aligned / oblique", "blotches-0"),
-        *("the preset, 0.02 min: axis-aligned / oblique", "blotches-0"),
+        *("the preset, 0.01 minutes: axis-aligned / oblique", "blotches-0"),
+        *("the preset, 0.02 minutes: axis-aligned / oblique", "blotches-0"),
     ]
     assert lines[1][2:6] == 4 * [" 1.00 "]
     for line in lines[4], lines[6]:
@@ -75,9 +74,17 @@ def test_the_preset_s_table_ends_with_median_and_worst():
     measured = {f"{value}": cell(f"stone{value}", value) for value in (1.0, 4.0, 2.0)} | {
         "early": cell("a", 9.0) | {"mark": 2.0}
     }
-    median, worst = recipe.exemplars_table(measured, 5.0).splitlines()[-2:]
+    median, worst = recipe.exemplars_table(measured, 5.0, "minutes").splitlines()[-2:]
     assert median == "| median | 200 | 2.00 / 4.00 |  |"
     assert worst == "| worst |  | 4.00 / 8.00 |  |"
+
+
+def test_marks_may_be_iterations(small, tmp_path, capsys):
+    flags = ["2,3" if flag == "0.01,0.02" else flag for flag in small]
+    recipe.main([*flags, "--by", "iterations", "--only", "fast"])
+    found = json.loads((tmp_path / "out" / "table.json").read_text())["fast"]
+    assert [cell["iterations"] for cell in found.values()] == [2, 3]
+    assert "the preset, 3 iterations: axis-aligned / oblique" in capsys.readouterr().out
 
 
 def test_what_cannot_be_run_is_refused_in_one_line(small, tmp_path, capsys):

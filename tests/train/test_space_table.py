@@ -21,12 +21,12 @@ from solidgrain.export.space_graphs import EncoderWeights
 from solidgrain.runtime import SolidgrainError, load_space
 from solidgrain.runtime.texture_file import read_texture
 from solidgrain.train.cuts import as_image
-from solidgrain.train.likelihood import BANDWIDTHS
 from solidgrain.train.loop import train
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import Measure
 from solidgrain.train.settings import Budget
 from tests.bench import cells, space_measure, space_table, space_values
+from tests.bench.likelihood import BANDWIDTHS
 from tests.bench.signed_rank import signed_rank
 from tests.bench.space_measure import Reference, cut_crops
 from tests.bench.space_methods import Methods, open_henzler

@@ -104,17 +104,17 @@ def test_samples_show_exemplars_of_both_kinds(tmp_path):
     assert (picture.height, picture.width) == (4 * 32, 3 * 32)
 
 
-@pytest.mark.parametrize(("group", "count", "distinct"), [(1, 6, 4), (2, 6, 2), (1, 3, 3)])
+@pytest.mark.parametrize(("count", "distinct"), [(6, 4), (3, 3)])
 def test_a_batch_is_of_as_many_exemplars_as_it_can_hold_and_the_encoder_sees_those_that_the_critic_sees(
-    tmp_path, group, count, distinct
+    tmp_path, count, distinct
 ):
-    task = TextureSpace(new_space(tmp_path / "run", members=count, batch=4, group=group), CPU)
+    task = TextureSpace(new_space(tmp_path / "run", members=count, batch=4), CPU)
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
         (_, points, seen), real, _ = task.draw(0, generator)
         assert len(points) == len(real) == 4
-        assert seen.shape == (4 // group, 3, 128, 128)
-        assert numbers(real) == [number for number in numbers(seen) for _ in range(group)]
+        assert seen.shape == (4, 3, 128, 128)
+        assert numbers(real) == numbers(seen)
         assert len(set(numbers(real))) == distinct
 
 
@@ -227,12 +227,10 @@ def test_a_space_has_budgets_and_settings_of_its_own(solidgrain, tmp_path, monke
         (["photo.png"], "leave photo.png out"),
         (["--anisotropic"], "--anisotropic: say x or y"),
         (["--hold-out", "none.txt"], "--hold-out none.txt: expected a number, or a file with a name per line"),
-        (["--batch", "3"], "--batch 3: expected a multiple of 2"),
         (["--patch", "16"], "--patch 16: expected at least 32"),
     ],
 )
-def test_flags_that_contradict_a_space_are_refused_in_one_line(solidgrain, tmp_path, monkeypatch, flags, message):
-    monkeypatch.setattr(settings, "PRESETS", settings.PRESETS | {"fast space": preset("fast space", group=2)})
+def test_flags_that_contradict_a_space_are_refused_in_one_line(solidgrain, tmp_path, flags, message):
     outcome = solidgrain("train", *flags, "--space", photographs(tmp_path / "stones", 2), "--out", tmp_path / "run")
     assert outcome.code == 2
     assert message in outcome.error
