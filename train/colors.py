@@ -13,9 +13,9 @@ from torch import Tensor
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.noise import draw_tables
 from solidgrain.train.sampler import NARROWEST, NoiseAtInputSampler, Sampler
+from solidgrain.train.slices import scatter
 
-INSTANCES, PLACES = 4, 1 << 15  # of noise; in each, so far apart that all are as good as independent
-REACH = 64.0  # units of 64 pixels
+INSTANCES, PLACES = 4, 1 << 15  # of noise; in each
 LEAST = 1e-6  # deviation of colours that are not all the same
 RESOLUTION = 64  # texels along each axis of a noise table
 
@@ -60,13 +60,11 @@ def mean_color(sampler: Sampler | NoiseAtInputSampler) -> Tensor:
 
 def colors_of(sampler: Sampler | NoiseAtInputSampler) -> Tensor:
     """Colours [N, 3] of the solid, from everywhere, as they are before they are clipped; float64."""
-    device = sampler.directions.device
-    generator = torch.Generator(device).manual_seed(7)
+    generator = torch.Generator(sampler.directions.device).manual_seed(7)
     colors = []
     for _ in range(INSTANCES):
         tables = draw_tables(len(sampler.directions), RESOLUTION, generator)
-        points = REACH * torch.rand(1, PLACES, 3, generator=generator, device=device)
-        colors.append(sampler(tables, points)[0].double())
+        colors.append(sampler(tables, scatter(1, PLACES, generator))[0].double())
     return torch.cat(colors).cpu()
 
 

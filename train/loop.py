@@ -15,13 +15,13 @@ from torch import Tensor, nn
 
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.train.companion import first_critic
-from solidgrain.train.losses import gradient_penalty, make_judge, style_loss
+from solidgrain.train.losses import color_loss, gradient_penalty, make_judge, style_loss
 from solidgrain.train.plateau import EVERY, Onlooker, Plateau
 from solidgrain.train.preview import write_preview
 from solidgrain.train.processes import Processes
 from solidgrain.train.run import CHECKPOINT, PARTS, Run, RunFolder
 from solidgrain.train.settings import Budget, Settings, rate
-from solidgrain.train.task import Batch, make_task
+from solidgrain.train.task import Batch, Colors, make_task
 from solidgrain.train.watch import SETTLING, Watch, flaw
 
 ALONE = Processes()
@@ -38,6 +38,7 @@ class Report:
     penalty: float | None  # where this iteration had one
     style: float  # L_style
     adversarial: float  # E[D(f)]
+    color: float | None  # L_color, if the settings have it
 
 
 class Ending(NamedTuple):
@@ -88,22 +89,24 @@ class Trainer:
             self._move(self.critic, self.critic_optimiser, critic_loss)
         self.critic.requires_grad_(False)  # the sampler's step needs its activations, not its gradients
         style, adversarial = self._sampler_losses(real, fake)
-        self._move(self.sampler, self.sampler_optimiser, settings.beta * style - settings.alpha * adversarial)
+        color = self._color_loss(batch.colors)
+        sampler_loss = settings.beta * style - settings.alpha * adversarial + settings.color_weight * color
+        self._move(self.sampler, self.sampler_optimiser, sampler_loss)
         self.critic.requires_grad_(True)
 
         self._update_average()
         self.iteration += 1
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)  # or the time would be that of launching kernels
-        return self._report(time.monotonic() - started, critic_loss, penalty, style, adversarial)
+        return self._report(time.monotonic() - started, critic_loss, penalty, style, adversarial, color)
 
     def _report(
-        self, elapsed: float, critic_loss: Tensor, penalty: Tensor | None, style: Tensor, adversarial: Tensor
+        self, elapsed: float, critic_loss: Tensor, penalty: Tensor | None, style: Tensor, adversarial: Tensor, color: Tensor
     ) -> Report:
         """The losses as numbers, the same in all processes, so that all of them decide alike."""
-        found = (critic_loss, torch.zeros(()) if penalty is None else penalty, style, adversarial, torch.tensor(elapsed))
+        found = (critic_loss, torch.zeros(()) if penalty is None else penalty, style, adversarial, color, torch.tensor(elapsed))
         values = torch.stack([value.detach().double().to(self.device) for value in found])
-        critic_mean, penalty_mean, style_mean, adversarial_mean, taken = self.processes.mean(values).tolist()
+        critic_mean, penalty_mean, style_mean, adversarial_mean, color_mean, taken = self.processes.mean(values).tolist()
         self.seconds += taken
         return Report(
             iteration=self.iteration,
@@ -112,13 +115,18 @@ class Trainer:
             penalty=None if penalty is None else penalty_mean,
             style=style_mean,
             adversarial=adversarial_mean,
+            color=color_mean if self.settings.color_weight else None,
         )
 
     def synthesise(self, batch: Batch) -> Tensor:
         """The batch's slices, as images."""
+        return self._colors(batch.inputs).reshape(-1, *batch.real.shape[2:], 3).permute(0, 3, 1, 2)
+
+    def _colors(self, inputs: tuple[Tensor, ...]) -> Tensor:
+        """The model's colours [B, P, 3]."""
         with self._autocast():  # the points are made outside it: in bfloat16 they are off by a tenth of a pixel
-            rgb: Tensor = self.sampler(*batch.inputs)
-        return rgb.float().reshape(-1, *batch.real.shape[2:], 3).permute(0, 3, 1, 2)
+            rgb: Tensor = self.sampler(*inputs)
+        return rgb.float()
 
     def _move(self, model: nn.Module, optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
         """One step of a model down its loss."""
@@ -148,6 +156,12 @@ class Trainer:
                 _, of_real = self.judge(real)
         style = style_loss(of_real, of_fake, settings.compares_relatively, settings.gram_energy)
         return style, on_fake.float().mean()
+
+    def _color_loss(self, colors: Colors | None) -> Tensor:
+        """L_color, where the batch has colours to compare."""
+        if colors is None:
+            return torch.zeros((), device=self.device)
+        return color_loss(colors.wanted, self._colors(colors.inputs)[0], self.generator)
 
     def _set_rates(self) -> None:
         s, lowered = self.settings, 0.5**self.setbacks

@@ -1,15 +1,22 @@
-"""The losses: WGAN-GP for the critic (Eq. 3), WGAN plus the Gram loss of the critic itself for the sampler (Eq. 4)."""
+"""The losses: WGAN-GP for the critic (Eq. 3), WGAN plus the Gram loss of the critic itself for the sampler (Eq. 4).
+
+And one that the paper does not have, of colours alone.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from solidgrain.train.contrast import FAINTEST
 from solidgrain.train.critic import Critic
 from solidgrain.train.settings import Settings
 from solidgrain.train.vgg import STYLE_LAYERS, Vgg
+
+PROJECTIONS = 16  # of colours, in each iteration others
 
 Judge = Callable[[Tensor], tuple[Tensor, list[Tensor]]]  # images -> D's logits [B, 1], activations of F per layer
 
@@ -78,6 +85,19 @@ def gram_difference(wanted: Tensor, found: Tensor, relative: bool) -> Tensor:
     """Mean absolute differences [B] of Gram matrices [B, C, C], over those wanted if `relative`."""
     difference = (wanted - found).abs().mean((1, 2))
     return difference / wanted.abs().mean((1, 2)) if relative else difference
+
+
+def color_loss(wanted: Tensor, found: Tensor, generator: torch.Generator) -> Tensor:
+    """L_color: how far colours [P, 3] are from others, as distributions, over the variance of those wanted.
+
+    The squared sliced Wasserstein distance (Bonneel et al. 2015; Heitz et al. 2021 take it between VGG's features): along a
+    random axis, the k-th of these belongs to the k-th of those. Gram matrices of D are moments. A material of three
+    colours and one of all that lie between them may share those.
+    """
+    axes = F.normalize(torch.randn(3, PROJECTIONS, generator=generator, device=generator.device), dim=0)
+    in_order, to_be = ((colors @ axes).sort(dim=0).values for colors in (found, wanted))
+    loss: Tensor = (in_order - to_be).square().mean() / wanted.var(dim=0).mean().clamp(min=FAINTEST**2)
+    return loss
 
 
 def mean_grams(batches: Iterable[Sequence[Tensor]]) -> list[Tensor]:

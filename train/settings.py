@@ -50,6 +50,7 @@ class Settings:
     penalty_every: int = 4  # iterations between penalties, each weighted that much more (lazy regularisation, StyleGAN2)
     drift: float = 0.001  # weight of E[D(r)^2] (gramgan/main.py; not in the paper)
     relative_gram: bool = False  # differences of Gram matrices over their size, else as they are
+    color_weight: float = 0.0  # of L_color: how colours are distributed in the solid and in the exemplar
     gram_energy: bool = False  # L_style is an energy distance: slices differ among themselves as the exemplar's patches do
 
     # Texture space (Sec. 3.2)
@@ -120,6 +121,7 @@ FAST = Settings(
     shared_noise=True,
     relative_gram=True,
     gram_energy=True,
+    color_weight=1.0,
     sampler_rate=4e-3,
     octave_rate=0.1,
 )
@@ -157,6 +159,7 @@ PRESETS = {
         alpha=0.1,
         sampler_start="",
         later_patch=0,
+        color_weight=0.0,
         color_moments=True,
         gram_energy=False,
         sampler_rate=1e-3,

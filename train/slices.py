@@ -11,6 +11,7 @@ from torch import Tensor
 from solidgrain.train.settings import Settings
 
 UNIT = 64.0  # pixels per unit of the coordinates that the octaves act on
+REACH = 64.0  # units in which places are scattered
 
 
 def draw_slices(settings: Settings, generator: torch.Generator) -> Tensor:
@@ -27,6 +28,11 @@ def flat_slice(size: int, device: torch.device) -> Tensor:
     ticks = torch.arange(size, device=device) / UNIT
     y, x = torch.meshgrid(ticks, ticks, indexing="ij")
     return torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
+
+
+def scatter(images: int, places: int, generator: torch.Generator) -> Tensor:
+    """Points [images, places, 3] so far apart that the solid's colours there are as good as independent."""
+    return REACH * torch.rand(images, places, 3, generator=generator, device=generator.device)
 
 
 def draw_rotations(settings: Settings, generator: torch.Generator) -> Tensor:

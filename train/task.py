@@ -19,12 +19,20 @@ from solidgrain.train.noise import draw_tables, shift_tables
 from solidgrain.train.run import Run, RunFolder
 from solidgrain.train.sampler import Sampler, make_sampler
 from solidgrain.train.settings import Settings
-from solidgrain.train.slices import draw_slices
+from solidgrain.train.slices import draw_slices, scatter
 from solidgrain.train.space import Space
 from solidgrain.train.space_run import SpaceRun
 
 PLACES = 4096  # at which an average is looked at
+COLORS = 1024  # places whose colours are compared: costlier than in a slice, for no two share a texel
 SHOWN = 4  # exemplars of a space in a sample, half of them held out
+
+
+class Colors(NamedTuple):
+    """Colours from all over the solid, and from all over its exemplar."""
+
+    inputs: tuple[Tensor, ...]  # what the model is called with for P of them
+    wanted: Tensor  # [P, 3]
 
 
 class Batch(NamedTuple):
@@ -33,6 +41,7 @@ class Batch(NamedTuple):
     inputs: tuple[Tensor, ...]  # noise tables, points [B, patch², 3], and for a space the patches that E sees
     real: Tensor  # [B, 3, patch, patch]
     stretch: Stretch  # what D sees of either
+    colors: Colors | None = None  # where L_color compares them
 
 
 class Probe(NamedTuple):
@@ -102,8 +111,15 @@ class SingleExemplar:
 
     def draw(self, iteration: int, generator: torch.Generator) -> Batch:
         settings = self.run.settings_at(iteration)
-        inputs = self.noise.draw(generator), draw_slices(settings, generator)
-        return Batch(inputs, exemplar.draw_patches(self.exemplar, settings, generator), self.stretch)
+        tables, points = self.noise.draw(generator), draw_slices(settings, generator)
+        real = exemplar.draw_patches(self.exemplar, settings, generator)
+        return Batch((tables, points), real, self.stretch, self._colors(tables, generator) if settings.color_weight else None)
+
+    def _colors(self, tables: Tensor, generator: torch.Generator) -> Colors:
+        """From as many places: those of a few slices are not independent of each other."""
+        pixels = self.exemplar.flatten(1).T
+        chosen = torch.randint(len(pixels), (COLORS,), generator=generator, device=self.device)
+        return Colors((tables, scatter(1, COLORS, generator)), pixels[chosen])
 
     def probe(self) -> Probe:
         return Probe(_probe_inputs(self.settings, 1, self.device), [self.exemplar])
@@ -168,4 +184,4 @@ def _probe_inputs(settings: Settings, images: int, device: torch.device) -> tupl
     """One instance at far-apart places, which are as independent as instances."""
     generator = torch.Generator(device).manual_seed(7)
     tables = draw_tables(settings.octaves, settings.resolution, generator)
-    return tables, 64 * torch.rand(images, PLACES, 3, generator=generator, device=device)
+    return tables, scatter(images, PLACES, generator)

@@ -25,8 +25,8 @@ CHANGES: dict[str, dict[str, Any]] = {
     "paper": {},
     "noise-at-input": {"noise_at_input": True, "sampler_start": ""},  # the embedded space has the method's
     "gan+vgg": {"style_features": "vgg"},
-    "a1b0": {"alpha": 1.0, "beta": 0.0},
-    "a0b1": {"alpha": 0.0, "beta": 1.0},
+    "a1b0": {"alpha": 1.0, "beta": 0.0, "color_weight": 0.0},
+    "a0b1": {"alpha": 0.0, "beta": 1.0, "color_weight": 0.0},
     "henzler": {"noise_at_input": True, "sampler_start": "", "rotations": "axis", "style_features": "vgg", "alpha": 0.0},
 }
 SLOWER = {"noise-at-input": 5.0}  # "we had to lower the learning rate by a factor of 5 [...] to achieve convergence"

@@ -72,6 +72,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
         "constant rates of S", as_paper("sampler_rate", "sampler_rate_floor", "sampler_half_life"),
     ),
     "energy": ("slices compared patch by patch", as_paper("gram_energy")),
+    "color-weight": ("no L_color", as_paper("color_weight")),
     "alpha": ("alpha 0.1", as_paper("alpha")),
     "later-patch": ("patches of 64² all along", as_paper("later_patch")),
     "patch": ("patches of 128² all along", as_paper("patch", "later_patch")),

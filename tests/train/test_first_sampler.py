@@ -92,5 +92,6 @@ def test_only_the_fast_preset_of_a_single_exemplar_begins_so(tmp_path, photograp
     expected = fresh(runs[0].exemplar)
     begin_as(expected, "stone", runs[0].exemplar)
     for name, value in expected.state_dict().items():
-        assert torch.equal(begun.state_dict()[name], value) or name in ("constant", "hidden.0.weight", "hidden.0.bias")
+        if name not in ("constant", "hidden.0.weight", "hidden.0.bias"):  # whose sum is the same, but for rounding
+            torch.testing.assert_close(begun.state_dict()[name], value, rtol=1e-4, atol=1e-5)
     assert not torch.equal(random.directions, expected.directions)

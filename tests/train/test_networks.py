@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from solidgrain.train.critic import Critic
-from solidgrain.train.losses import gradient_penalty, gram_matrices, mean_gram, style_loss
+from solidgrain.train.losses import color_loss, gradient_penalty, gram_matrices, mean_gram, style_loss
 from solidgrain.train.noise import draw_tables, look_up, shift_tables
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import FAST, PAPER, preset, rate
@@ -152,6 +152,31 @@ def test_an_energy_distance_of_one_patch_is_the_difference_and_may_be_relative()
     real, fake = torch.randn(2, 3, 5, 8, 8, generator=generator())
     relative = style_loss([real], [fake], relative=True, energy=True)
     torch.testing.assert_close(style_loss([9 * real], [9 * fake], relative=True, energy=True), relative)
+
+
+def test_the_loss_of_colours_compares_distributions_whatever_their_order():
+    colors = torch.rand(500, 3, generator=generator())
+    assert color_loss(colors, colors.flip(0), generator()).item() == pytest.approx(0, abs=1e-6)
+    shifted = color_loss(colors, colors + 0.1, generator()).item()
+    assert shifted > 0.01
+    assert color_loss(0.1 * colors, 0.1 * (colors + 0.1), generator()).item() == pytest.approx(shifted, rel=1e-3)
+
+
+def test_the_loss_of_colours_tells_two_colours_from_all_between_them():
+    """Which mean and covariance do not."""
+    two = torch.tensor([[0.2, 0.4, 0.6], [0.8, 0.6, 0.4]]).repeat(500, 1)
+    middle = two.mean(0)
+    between = middle + torch.randn(1000, 1, generator=generator()) * (two[1] - two[0]) / 2
+    mixed, again = color_loss(two, between, generator()), color_loss(two, two.flip(0), generator())
+    assert mixed > 0.05
+    assert again < 1e-6
+
+
+def test_the_loss_of_colours_is_finite_for_an_exemplar_of_one_colour():
+    flat = torch.full((9, 3), 0.3)
+    found = torch.full((9, 3), 0.5, requires_grad=True)
+    color_loss(flat, found, generator()).backward()
+    assert found.grad.isfinite().all()
 
 
 def test_colours_are_float32_where_hidden_layers_are_not():

@@ -111,7 +111,7 @@ def test_a_batch_is_of_as_many_exemplars_as_it_can_hold_and_the_encoder_sees_tho
     task = TextureSpace(new_space(tmp_path / "run", members=count, batch=4), CPU)
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
-        (_, points, seen), real, _ = task.draw(0, generator)
+        (_, points, seen), real, *_ = task.draw(0, generator)
         assert len(points) == len(real) == 4
         assert seen.shape == (4, 3, 128, 128)
         assert numbers(real) == numbers(seen)
@@ -120,7 +120,7 @@ def test_a_batch_is_of_as_many_exemplars_as_it_can_hold_and_the_encoder_sees_tho
 
 def test_the_encoder_and_the_critic_see_different_patches_of_an_exemplar(tmp_path):
     task = TextureSpace(new_space(tmp_path / "run", patch=128), CPU)
-    (*_, seen), real, _ = task.draw(0, torch.Generator().manual_seed(0))
+    (*_, seen), real, *_ = task.draw(0, torch.Generator().manual_seed(0))
     assert not torch.equal(seen, real)
 
 
