@@ -60,7 +60,7 @@ class Trainer:
         self.critic = critic.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.judge = make_judge(self.settings, self.critic, device)
         self.sampler = self.task.make_model(self.generator)
-        if not (run.folder / CHECKPOINT).exists():  # which brings weights of its own
+        if not (run.folder / CHECKPOINT).exists():  # a checkpoint brings weights of its own
             self.task.begin(self.sampler)
         self.average = copy.deepcopy(self.sampler).requires_grad_(False)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), betas=(0.5, 0.999), fused=True)
@@ -120,9 +120,9 @@ class Trainer:
 
     def synthesise(self, batch: Batch) -> Tensor:
         """The batch's slices, as images."""
-        return self._colors(batch.inputs).reshape(-1, *batch.real.shape[2:], 3).permute(0, 3, 1, 2)
+        return self._synthesise(batch.inputs).reshape(-1, *batch.real.shape[2:], 3).permute(0, 3, 1, 2)
 
-    def _colors(self, inputs: tuple[Tensor, ...]) -> Tensor:
+    def _synthesise(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """The model's colours [B, P, 3]."""
         with self._autocast():  # the points are made outside it: in bfloat16 they are off by a tenth of a pixel
             rgb: Tensor = self.sampler(*inputs)
@@ -158,10 +158,19 @@ class Trainer:
         return style, on_fake.float().mean()
 
     def _color_loss(self, colors: Colors | None) -> Tensor:
-        """L_color, where the batch has colours to compare."""
+        """L_color, where the batch has colours to compare.
+
+        How colours are distributed does not depend on T_i. So far from the origin their gradients would be nothing but large.
+        """
         if colors is None:
             return torch.zeros((), device=self.device)
-        return color_loss(colors.wanted, self._colors(colors.inputs)[0], self.generator)
+        octaves = [parameter for name, parameter in self.sampler.named_parameters() if is_octave(name)]
+        for parameter in octaves:
+            parameter.requires_grad_(False)
+        found = self._synthesise(colors.inputs)[0]
+        for parameter in octaves:
+            parameter.requires_grad_(True)
+        return color_loss(colors.wanted, found, self.generator)
 
     def _set_rates(self) -> None:
         s, lowered = self.settings, 0.5**self.setbacks
@@ -330,8 +339,13 @@ def parameter_groups(model: nn.Module, settings: Settings) -> list[dict[str, Any
     octaves: list[nn.Parameter] = []
     others: list[nn.Parameter] = []
     for name, parameter in model.named_parameters():
-        (octaves if "directions" in name or ".octaves." in name else others).append(parameter)
+        (octaves if is_octave(name) else others).append(parameter)
     return [{"params": others, "share": 1.0}, {"params": octaves, "share": settings.octave_rate}]
+
+
+def is_octave(name: str) -> bool:
+    """Whether a parameter of that name is T_i, or of the network Q that makes them."""
+    return "directions" in name or ".octaves." in name
 
 
 def use_bfloat16(settings: Settings, device: torch.device) -> bool:

@@ -50,7 +50,7 @@ class Settings:
     penalty_every: int = 4  # iterations between penalties, each weighted that much more (lazy regularisation, StyleGAN2)
     drift: float = 0.001  # weight of E[D(r)^2] (gramgan/main.py; not in the paper)
     relative_gram: bool = False  # differences of Gram matrices over their size, else as they are
-    color_weight: float = 0.0  # of L_color: how colours are distributed in the solid and in the exemplar
+    color_weight: float = 0.0  # of L_color, how colours are distributed in the solid and in its single exemplar
     gram_energy: bool = False  # L_style is an energy distance: slices differ among themselves as the exemplar's patches do
 
     # Texture space (Sec. 3.2)
@@ -189,6 +189,10 @@ def to_json(settings: Settings) -> dict[str, Any]:
 
 def from_json(values: dict[str, Any]) -> Settings:
     """Settings back from `options.json`. Raises TrainingError if it names a setting that does not exist."""
+    if values.get("group", 1) != 1 or (values.get("pooled_gram") and not values.get("latent")):
+        raise TrainingError(
+            "options.json: written by an earlier version, with patches in groups or Gram matrices pooled; train anew"
+        )
     values = {name: value for name, value in values.items() if name not in RETIRED}
     unknown = set(values) - {field.name for field in fields(Settings)}
     if unknown:

@@ -24,7 +24,7 @@ from solidgrain.train.space import Space
 from solidgrain.train.space_run import SpaceRun
 
 PLACES = 4096  # at which an average is looked at
-COLORS = 1024  # places whose colours are compared: costlier than in a slice, for no two share a texel
+COLOR_PLACES = 1024  # places whose colours are compared: costlier than in a slice, for no two share a texel
 SHOWN = 4  # exemplars of a space in a sample, half of them held out
 
 
@@ -113,13 +113,14 @@ class SingleExemplar:
         settings = self.run.settings_at(iteration)
         tables, points = self.noise.draw(generator), draw_slices(settings, generator)
         real = exemplar.draw_patches(self.exemplar, settings, generator)
-        return Batch((tables, points), real, self.stretch, self._colors(tables, generator) if settings.color_weight else None)
+        colors = self._draw_colors(tables, generator) if settings.color_weight else None
+        return Batch((tables, points), real, self.stretch, colors)
 
-    def _colors(self, tables: Tensor, generator: torch.Generator) -> Colors:
-        """From as many places: those of a few slices are not independent of each other."""
+    def _draw_colors(self, tables: Tensor, generator: torch.Generator) -> Colors:
+        """At scattered places, for those of a few slices depend on each other."""
         pixels = self.exemplar.flatten(1).T
-        chosen = torch.randint(len(pixels), (COLORS,), generator=generator, device=self.device)
-        return Colors((tables, scatter(1, COLORS, generator)), pixels[chosen])
+        chosen = torch.randint(len(pixels), (COLOR_PLACES,), generator=generator, device=self.device)
+        return Colors((tables, scatter(1, COLOR_PLACES, generator)), pixels[chosen])
 
     def probe(self) -> Probe:
         return Probe(_probe_inputs(self.settings, 1, self.device), [self.exemplar])

@@ -10,8 +10,8 @@
 The paper ran Henzler et al.'s own model; `henzler` is what the paper says sets it apart, in a sampler of our size, with our
 optimiser and the L1 distance of Eq. 4. For GAN+VGG the paper "chose the hyperparameters to approximately result in the same
 weighting as ours": here α and β stay, and VGG's L_style is taken relative to the exemplar's Gram matrices. Between batches of
-the exemplar's own patches it is then 0.09 to 0.12, where D's, compared likewise, ended near 0.13 in a good
-run. The VGG is VGG-16 (the paper names VGG-19), up to conv4_1.
+the exemplar's own patches it is then 0.09 to 0.12, where D's, compared likewise, ended near 0.13 in a good run. The VGG is
+VGG-16 (the paper names VGG-19), up to conv4_1.
 """
 
 from __future__ import annotations
@@ -27,7 +27,14 @@ CHANGES: dict[str, dict[str, Any]] = {
     "gan+vgg": {"style_features": "vgg"},
     "a1b0": {"alpha": 1.0, "beta": 0.0, "color_weight": 0.0},
     "a0b1": {"alpha": 0.0, "beta": 1.0, "color_weight": 0.0},
-    "henzler": {"noise_at_input": True, "sampler_start": "", "rotations": "axis", "style_features": "vgg", "alpha": 0.0},
+    "henzler": {
+        "noise_at_input": True,
+        "sampler_start": "",
+        "rotations": "axis",
+        "style_features": "vgg",
+        "alpha": 0.0,
+        "color_weight": 0.0,
+    },
 }
 SLOWER = {"noise-at-input": 5.0}  # "we had to lower the learning rate by a factor of 5 [...] to achieve convergence"
 

@@ -103,14 +103,17 @@ def main(argv: Sequence[str] | None = None) -> None:
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = cells.arguments_of(__doc__.splitlines()[0], Path("build/recipe"), slices=8)
     add = parser.add_argument
-    add("--marks", type=parse_marks, default=MARKS, metavar="M,M,...", help="when to measure (2,4,6)")
+    add("--marks", type=parse_marks, default=MARKS, metavar="M,M,...", help="when to measure, by minutes or iterations (2,4,6)")
     add("--by", choices=("minutes", "iterations"), default="minutes", help="what marks count (minutes)")
     add("--seeds", type=parse_positive, default=2, metavar="N", help="trainings of each row on each exemplar (2)")
     add("--only", action="append", default=[], choices=ROWS, metavar="ROW", help=f"of {', '.join(ROWS)} (all)")
     add("--exemplar", action="append", type=Path, default=[], metavar="PHOTO", help="instead of the three; may be repeated")
     add("--anisotropic", action="append", type=Path, default=[], metavar="PHOTO", help="another one, with a grain")
     add("--largest", type=parse_positive, default=LARGEST, metavar="PX", help=f"of larger photographs the middle ({LARGEST})")
-    return parser.parse_args(argv)
+    arguments = parser.parse_args(argv)
+    if arguments.by == "iterations" and any(mark % 1 for mark in arguments.marks):
+        raise UsageError(f"--marks {','.join(f'{mark:g}' for mark in arguments.marks)}: expected whole numbers of iterations")
+    return arguments
 
 
 def parse_marks(text: str) -> list[float]:

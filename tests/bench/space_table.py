@@ -5,7 +5,7 @@ python -m tests.bench.space_table --bundle BUNDLE --seconds 60 --threads 1 --out
 For each held-out photograph of the bundle's training: crops of the photograph itself (the paper's "ground truth"), the
 texture that the space makes of the 128² pixels at its middle, and the same adapted to them with D's and with VGG's features
 (Sec. 3.3). Measured are distances over the photograph's own floor, and ALL, the average log-likelihood of small patches
-(space_measure.py, `solidgrain.train.likelihood`). Then the same for one photograph that is no stone at all (the paper's
+(space_measure.py, `tests.bench.likelihood`). Then the same for one photograph that is no stone at all (the paper's
 figure of extrapolation), and with --large for every photograph of a folder. FOLDER gets table.md, table.json, pictures, the
 adapted textures, and a folder of results for each photograph; what is there is not made again.
 """

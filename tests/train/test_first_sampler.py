@@ -94,4 +94,6 @@ def test_only_the_fast_preset_of_a_single_exemplar_begins_so(tmp_path, photograp
     for name, value in expected.state_dict().items():
         if name not in ("constant", "hidden.0.weight", "hidden.0.bias"):  # whose sum is the same, but for rounding
             torch.testing.assert_close(begun.state_dict()[name], value, rtol=1e-4, atol=1e-5)
+    first, wanted = (sampler.hidden[0](sampler.constant) for sampler in (begun, expected))
+    torch.testing.assert_close(first, wanted, rtol=1e-4, atol=1e-5)
     assert not torch.equal(random.directions, expected.directions)

@@ -167,6 +167,7 @@ def test_the_loss_of_colours_tells_two_colours_from_all_between_them():
     two = torch.tensor([[0.2, 0.4, 0.6], [0.8, 0.6, 0.4]]).repeat(500, 1)
     middle = two.mean(0)
     between = middle + torch.randn(1000, 1, generator=generator()) * (two[1] - two[0]) / 2
+    torch.testing.assert_close(torch.cov(between.T), torch.cov(two.T), atol=0.01, rtol=0.1)
     mixed, again = color_loss(two, between, generator()), color_loss(two, two.flip(0), generator())
     assert mixed > 0.05
     assert again < 1e-6
@@ -236,7 +237,8 @@ def test_the_paper_preset_is_the_paper_s():
     expected = {
         "octaves": 16, "width": 128, "resolution": 64, "octave_span": 15.0, "orthogonal_start": False,
         "patch": 128, "batch": 16, "rotations": "euler", "transposed": False,
-        "alpha": 0.1, "beta": 1.0, "gram_energy": False, "penalty": 10.0, "penalty_every": 1, "drift": 0.001,
+        "alpha": 0.1, "beta": 1.0, "gram_energy": False, "color_weight": 0.0,
+        "penalty": 10.0, "penalty_every": 1, "drift": 0.001,
         "critic_rate": 2e-3, "sampler_rate": 5e-4,
     }  # fmt: skip
     assert {name: getattr(PAPER, name) for name in expected} == expected

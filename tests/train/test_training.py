@@ -19,12 +19,12 @@ from solidgrain.export.from_run import check_agreement, export_run, sampler_weig
 from solidgrain.runtime import BundleError, TrainingError, load
 from solidgrain.runtime.bundle import open_bundle
 from solidgrain.train import command
-from solidgrain.train.loop import train
+from solidgrain.train.loop import Trainer, train
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import Budget, preset
-from solidgrain.train.task import make_task
+from solidgrain.train.task import SingleExemplar, make_task
 from tests.train.conftest import blotches
 
 TINY = {
@@ -127,6 +127,26 @@ def test_later_patches_are_larger_where_the_exemplar_has_room(tmp_path, photogra
     assert small.settings_at(9).patch == 32
     card = (export_run(whole.folder, tmp_path / "bundle") / "card.md").read_text()
     assert "2 of 32², 40² from iteration 4 on, pixels per iteration" in card
+
+
+def test_the_sampler_learns_colours_and_its_octaves_do_not(tmp_path, photograph):
+    runs = [new_run(tmp_path / f"weight-{weight:g}", photograph, color_weight=weight) for weight in (0.0, 1.0)]
+    for run, counted in zip(runs, (False, True), strict=True):
+        train(run, Budget(iterations=1), CPU)
+        assert [isinstance(line["color"], float) for line in losses(run.folder)] == [counted]
+    trainer = Trainer(new_run(tmp_path / "run", photograph), CPU)
+    batch = trainer.task.draw(0, trainer.generator)
+    trainer._color_loss(batch.colors).backward()
+    assert trainer.sampler.output.weight.grad.abs().max() > 0
+    assert trainer.sampler.directions.grad is None
+    assert trainer.sampler.directions.requires_grad
+
+
+def test_a_run_with_a_checkpoint_is_not_begun_again(tmp_path, photograph, monkeypatch):
+    run = new_run(tmp_path / "run", photograph)
+    train(run, Budget(iterations=1), CPU)
+    monkeypatch.setattr(SingleExemplar, "begin", lambda *_: pytest.fail("begun again"))
+    train(run, Budget(iterations=2), CPU)
 
 
 def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, photograph):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -77,7 +77,18 @@ def test_options_that_predate_variants_are_the_method():
     for added in ("variant", "noise_at_input", "style_features"):
         del values[added]
     assert from_json(values) == FAST
-    assert from_json(values | {"keep_best": True, "group": 1}) == FAST  # of versions that had them
+    del values["color_weight"]
+    assert from_json(values) == replace(FAST, color_weight=0.0)
+
+
+def test_settings_that_are_gone_are_dropped_where_they_changed_nothing_and_refused_where_they_did():
+    retired = {"keep_best": True, "group": 1, "pooled_gram": False}
+    assert from_json(to_json(FAST) | retired) == FAST
+    space = preset("fast space")
+    assert from_json(to_json(space) | retired | {"pooled_gram": True}) == space
+    for changed in {"group": 2}, {"pooled_gram": True}:
+        with pytest.raises(TrainingError, match="written by an earlier version"):
+            from_json(to_json(FAST) | retired | changed)
 
 
 def test_noise_at_the_input_is_a_plain_perceptron_on_the_noise():
