@@ -87,6 +87,12 @@ def test_marks_may_be_iterations(small, tmp_path, capsys):
     assert "the preset, 3 iterations: axis-aligned / oblique" in capsys.readouterr().out
 
 
+def test_half_an_iteration_is_refused_in_one_line(small, tmp_path, capsys):
+    assert cells.reported(lambda: recipe.main([*small, "--by", "iterations"])) == 2
+    assert "--marks 0.01,0.02: expected whole numbers of iterations" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_cannot_be_run_is_refused_in_one_line(small, tmp_path, capsys):
     assert cells.reported(lambda: recipe.main([*small, "--exemplar", str(tmp_path / "none.png")])) == 2
     assert "no such file" in capsys.readouterr().err
