@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from solidgrain.export.figures import Figures
 from solidgrain.runtime.errors import SolidgrainError
 from solidgrain.runtime.files import replacing
 from solidgrain.train.copying import Pair
-from solidgrain.train.cuts import Sample, axis_rotation, cut, oblique_rotation, random_place
+from solidgrain.train.cuts import Sample, axis_rotation, oblique_rotation, take_slices
 from solidgrain.train.exemplar import FloatArray
 
 Pixels = npt.NDArray[np.uint8]  # [H, W, 3]
@@ -82,12 +83,11 @@ def write_sheet(path: Path, sheet: Sheet) -> None:
 
 def _slices(sample: Sample, size: int, grain: str, axis: bool) -> list[FloatArray]:
     """Three slices of as many instances, at fixed random places."""
-    slices = []
-    for seed in range(3):
-        generator = torch.Generator().manual_seed(seed)
-        rotation = axis_rotation(seed, grain) if axis else oblique_rotation(generator, grain)
-        slices.append(cut(sample, size, rotation, seed, random_place(generator)))
-    return slices
+
+    def rotation_of(seed: int, generator: torch.Generator) -> Tensor:
+        return axis_rotation(seed, grain) if axis else oblique_rotation(generator, grain)
+
+    return list(take_slices(sample, size, 3, rotation_of))
 
 
 def _enlarged(picture: FloatArray, scale: int) -> Pixels:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.slices import UNIT, about_axis, flat_slice, from_quaternions, upright
 
 Sample = Callable[[npt.NDArray[np.float64], int], FloatArray]  # points [P, 3] in exemplar pixels, seed -> rgb [P, 3]
+RotationOf = Callable[[int, torch.Generator], Tensor]  # seed, its random stream -> [3, 3]
 REACH = 2048  # pixels: slices are taken at random places up to here
 
 
@@ -28,6 +29,14 @@ def cut(
     flat = (flat_slice(size, torch.device("cpu")) * UNIT * spacing).double()
     points = flat @ rotation.double().T + torch.as_tensor(place, dtype=torch.float64)
     return sample(points.numpy(), seed).reshape(size, size, 3)
+
+
+def take_slices(sample: Sample, size: int, count: int, rotation_of: RotationOf) -> Iterator[FloatArray]:
+    """Slices [size, size, 3] of so many instances, at random places, rotated as each one's seed and random stream say."""
+    for seed in range(count):
+        generator = torch.Generator().manual_seed(seed)
+        rotation = rotation_of(seed, generator)
+        yield cut(sample, size, rotation, seed, random_place(generator))
 
 
 def random_place(generator: torch.Generator) -> Tensor:

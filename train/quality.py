@@ -15,7 +15,7 @@ Images here are tensors [1, 3, H, W] in [0, 1].
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from solidgrain.runtime.errors import ExemplarError
-from solidgrain.train.cuts import Sample, as_image, axis_rotation, cut, oblique_rotation, random_place
+from solidgrain.train.cuts import RotationOf, Sample, as_image, axis_rotation, oblique_rotation, take_slices
 from solidgrain.train.exemplar import FloatArray, nonstationarity
 from solidgrain.train.inception import Inception
 from solidgrain.train.losses import gram_difference, gram_matrices
@@ -82,8 +82,8 @@ def evaluate(
     others = [measure.statistics(turned_as_slices_are(square, grain)) for square in squares]
     turned = _mean(measure.distances(a, b) for i, a in enumerate(crops) for j, b in enumerate(others) if i != j)
 
-    def pictures(rotation_of: Callable[[int, torch.Generator], Tensor]) -> Iterator[Statistics]:
-        return map(measure.statistics, take_slices(sample, size, slices, rotation_of))
+    def pictures(rotation_of: RotationOf) -> Iterator[Statistics]:
+        return (measure.statistics(as_image(one)) for one in take_slices(sample, size, slices, rotation_of))
 
     axis, _ = _compared(measure, pictures(lambda seed, generator: axis_rotation(seed, grain)), crops, floor)
     oblique, among = _compared(measure, pictures(lambda seed, generator: oblique_rotation(generator, grain)), crops, floor)
@@ -98,16 +98,6 @@ def evaluate(
         grain=grain,
         among=among,
     )
-
-
-def take_slices(
-    sample: Sample, size: int, count: int, rotation_of: Callable[[int, torch.Generator], Tensor]
-) -> Iterator[Tensor]:
-    """Slices of `size`² pixels, each of another instance, rotated as a seed and its random stream say."""
-    for seed in range(count):
-        generator = torch.Generator().manual_seed(seed)
-        rotation = rotation_of(seed, generator)
-        yield as_image(cut(sample, size, rotation, seed, random_place(generator)))
 
 
 def turned_as_slices_are(image: Tensor, grain: str) -> Tensor:
