@@ -35,21 +35,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    import torch
+
     from solidgrain.export.evaluation import exemplar_scale, grain_of, measure, write_quality
     from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load_texture
+    from solidgrain.runtime.provider import usable_threads
     from solidgrain.train.inception import Inception
     from solidgrain.train.photograph import read_exemplar
     from solidgrain.train.quality import SMALLEST
 
     if arguments.sheet:
         check_sheet(arguments.sheet, arguments.exemplar)
+    torch.set_num_threads(arguments.threads or usable_threads())
     inception = Inception(arguments.inception) if arguments.inception else None
     texture = load_texture(arguments.source, bundle=arguments.bundle, threads=arguments.threads)
     if arguments.card and texture.bundle.is_space:
         raise UsageError(f"--card: {texture.bundle.name} is a space, its card not that of one texture; leave --card out")
     scale = arguments.patch_scale or exemplar_scale(texture)
-    exemplar = read_exemplar(arguments.exemplar, SMALLEST, scale)
+    exemplar = read_exemplar(arguments.exemplar, SMALLEST, scale, "use a larger photograph or a smaller --patch-scale")
     reduced = "" if scale == 1 else f", of whose pixels {scale:g}x{scale:g} are one"
     print(f"measuring {2 * arguments.slices} slices of {texture.name} against {arguments.exemplar}{reduced}", file=sys.stderr)
     found = measure(texture, exemplar, arguments.slices, inception)

@@ -9,6 +9,7 @@ from solidgrain.export.card import with_quality
 from solidgrain.export.figures import Figures, make_figures
 from solidgrain.runtime import Texture
 from solidgrain.runtime.bundle import CARD, Bundle
+from solidgrain.runtime.errors import BundleError
 from solidgrain.runtime.files import replacing
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.copying import Copying, Pair, measure_copying
@@ -57,8 +58,11 @@ def measure(texture: Texture, exemplar: FloatArray, slices: int, inception: Ince
 
 
 def write_quality(texture: Texture, figures: Figures) -> None:
-    """Write the figures into the model card of a texture's bundle."""
+    """Write the figures into the model card of a texture's bundle. Raises BundleError if that cannot be done."""
     card = texture.bundle.folder / CARD
     written = card.read_text("utf-8") if card.is_file() else f"# {texture.name}\n"
-    with replacing(card) as file:
-        file.write(with_quality(written, figures.markdown()).encode())
+    try:
+        with replacing(card) as file:
+            file.write(with_quality(written, figures.markdown()).encode())
+    except OSError as error:
+        raise BundleError(f"{card}: cannot write the model card ({error.strerror}); the figures are as printed") from error

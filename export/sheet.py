@@ -55,7 +55,7 @@ def make_sheet(name: str, exemplar: FloatArray, sample: Sample, grain: str, pair
     """Draw everything that a sheet shows."""
     size = min(*exemplar.shape[:2], PANEL)
     top, left = ((extent - size) // 2 for extent in exemplar.shape[:2])
-    wide = _slices(sample, 2 * size, grain, axis=True)[0].reshape(size, 2, size, 2, 3).mean((1, 3))
+    wide = _slices(sample, 2 * size, grain, axis=True, count=1)[0].reshape(size, 2, size, 2, 3).mean((1, 3))
     rows = [
         [("exemplar", exemplar[top : top + size, left : left + size])]
         + [(f"axis-aligned slice {i}", one) for i, one in enumerate(_slices(sample, size, grain, axis=True), 1)],
@@ -81,13 +81,13 @@ def write_sheet(path: Path, sheet: Sheet) -> None:
         raise SolidgrainError(f"--sheet {path}: cannot write ({error.strerror})") from error
 
 
-def _slices(sample: Sample, size: int, grain: str, axis: bool) -> list[FloatArray]:
-    """Three slices of as many instances, at fixed random places."""
+def _slices(sample: Sample, size: int, grain: str, axis: bool, count: int = 3) -> list[FloatArray]:
+    """Slices of as many instances, at fixed random places."""
 
     def rotation_of(seed: int, generator: torch.Generator) -> Tensor:
         return axis_rotation(seed, grain) if axis else oblique_rotation(generator, grain)
 
-    return list(take_slices(sample, size, 3, rotation_of))
+    return list(take_slices(sample, size, count, rotation_of))
 
 
 def _enlarged(picture: FloatArray, scale: int) -> Pixels:

@@ -32,7 +32,7 @@ from solidgrain.train.losses import gram_difference, mean_gram, mean_grams
 from solidgrain.train.noise import draw_tables, look_up
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, draw_slices
-from solidgrain.train.vgg import STYLE_LAYERS, Vgg
+from solidgrain.train.vgg import Vgg
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -145,13 +145,7 @@ def critic_features(companion: Companion, device: torch.device) -> Features:
 
 def vgg_features(device: torch.device) -> Features:
     """What the paper compares it with: activations of a pretrained VGG. Raises SolidgrainError without its weights."""
-    vgg = Vgg(device)
-
-    def activations(images: Tensor) -> list[Tensor]:
-        found = vgg.features(images, padding=1)
-        return [found[layer] for layer in STYLE_LAYERS]
-
-    return Features(activations, relative=True)
+    return Features(Vgg(device).style, relative=True)
 
 
 class Adaptation:

@@ -103,8 +103,17 @@ def run(arguments: argparse.Namespace) -> int:
             return FAILED
         except KeyboardInterrupt:
             if processes.first:
-                raise
+                tell_of_interruption(arguments.resume or arguments.out)
             return INTERRUPTED
+
+
+def tell_of_interruption(folder: Path) -> None:
+    """Of a training that was not left the time to save."""
+    from solidgrain.train.run import OPTIONS
+
+    if not (folder / OPTIONS).exists():
+        raise KeyboardInterrupt  # nothing to speak of was begun
+    print(f"interrupted; go on from its last checkpoint with: solidgrain train --resume {folder}", file=sys.stderr)
 
 
 def train_together(arguments: argparse.Namespace, device: torch.device, processes: Processes) -> int:

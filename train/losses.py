@@ -14,7 +14,7 @@ from torch import Tensor
 from solidgrain.train.contrast import FAINTEST
 from solidgrain.train.critic import Critic
 from solidgrain.train.settings import Settings
-from solidgrain.train.vgg import STYLE_LAYERS, Vgg
+from solidgrain.train.vgg import Vgg
 
 PROJECTIONS = 16  # of colours, in each iteration others
 
@@ -29,8 +29,7 @@ def make_judge(settings: Settings, critic: Critic, device: torch.device) -> Judg
 
     def judge(images: Tensor) -> tuple[Tensor, list[Tensor]]:
         logits = critic(images)[0] if settings.trains_critic else torch.zeros(len(images), 1, device=device)
-        activations = vgg.features(images, padding=1)
-        return logits, [activations[layer] for layer in STYLE_LAYERS]
+        return logits, vgg.style(images)
 
     return judge
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float32]
 
-ADVICE = "use a larger photograph or a smaller --patch"
+ADVICE = "use a larger photograph, or a smaller --patch or --patch-scale"
 LARGEST = 64 * 2**20  # pixels; 768 MB as float32 RGB, far more than one texture can learn from
 SUFFIXES = frozenset([".bmp", ".exr", ".hdr", ".jpeg", ".jpg", ".jxl", ".png", ".tga", ".tif", ".tiff", ".webp"])
 
@@ -29,15 +29,16 @@ class Photograph(NamedTuple):
     warning: str  # what the file declares of its colours that could not be honoured, or ""
 
 
-def read_exemplar(path: str | os.PathLike[str], smallest: int, scale: float = 1.0) -> FloatArray:
+def read_exemplar(path: str | os.PathLike[str], smallest: int, scale: float = 1.0, advice: str = ADVICE) -> FloatArray:
     """The pixels of `read_photograph`, `scale` of them in one; `smallest` is what is left along an axis."""
-    return scaled(read_photograph(path, round(smallest * scale)).pixels, scale)
+    return scaled(read_photograph(path, round(smallest * scale), advice).pixels, scale)
 
 
 def read_photograph(path: str | os.PathLike[str], smallest: int, advice: str = ADVICE) -> Photograph:
     """A photograph as sRGB-encoded RGB, [H, W, 3] float32 in [0, 1].
 
-    Anything that OpenImageIO reads: 8 and 16 bit, float, grey (repeated), alpha (dropped), CMYK (converted by its reader).
+    Anything that OpenImageIO reads: 8 and 16 bit, float, grey (repeated), alpha (dropped), CMYK (converted by its reader), as
+    viewers show it: turned as Exif's Orientation says.
     Colours of another space that the file declares (encoding.py) are converted to sRGB and clipped. Raises ExemplarError when
     the file is missing, unreadable, incomplete, smaller than `smallest` pixels along an axis (`advice` says what to do then) or
     larger than `LARGEST` pixels.
@@ -49,6 +50,10 @@ def read_photograph(path: str | os.PathLike[str], smallest: int, advice: str = A
     path = Path(path)
     if not path.is_file():
         raise ExemplarError(f"{path}: no such file; expected a photograph (PNG, JPEG, TIFF, EXR, ...)")
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError as strange:
+        raise ExemplarError(f"{path}: the name is not UTF-8, with which OpenImageIO opens no file; rename it") from strange
     if path.stat().st_size == 0:
         raise ExemplarError(f"{path}: the file is empty; expected a photograph (PNG, JPEG, TIFF, EXR, ...)")
     straight = oiio.ImageSpec()
@@ -68,9 +73,20 @@ def read_photograph(path: str | os.PathLike[str], smallest: int, advice: str = A
     rgb = np.asarray(pixels, np.float32)[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
     if not np.isfinite(rgb).all():
         raise ExemplarError(f"{path}: holds NaN or infinite pixels; expected finite colours")
-    encoded = encode(rgb, spec)
+    encoded = encode(upright(rgb, spec.get_int_attribute("Orientation", 1)), spec)
     pixels = np.ascontiguousarray(encoded.rgb.clip(0.0, 1.0), np.float32)
     return Photograph(pixels, encoded.colorspace, encoded.warning)
+
+
+def upright(pixels: FloatArray, orientation: int) -> FloatArray:
+    """A picture [H, W, 3] as it is to be shown, by its Orientation (TIFF 6.0, p. 36, and Exif), which is 1 to 8."""
+    if not 2 <= orientation <= 8:  # as it is
+        return pixels
+    import OpenImageIO as oiio
+
+    stored = oiio.ImageBuf(np.ascontiguousarray(pixels))
+    stored.orientation = orientation
+    return np.asarray(oiio.ImageBufAlgo.reorient(stored).get_pixels(oiio.FLOAT), np.float32)
 
 
 def scaled(pixels: FloatArray, scale: float) -> FloatArray:
@@ -91,9 +107,7 @@ def scaled(pixels: FloatArray, scale: float) -> FloatArray:
 def _check_size(path: Path, spec: oiio.ImageSpec, smallest: int, advice: str) -> None:
     width, height = spec.width, spec.height
     if min(width, height) < smallest:
-        raise ExemplarError(
-            f"{path}: {width}x{height} pixels, expected at least {smallest}x{smallest} (one training patch); {advice}"
-        )
+        raise ExemplarError(f"{path}: {width}x{height} pixels, expected at least {smallest}x{smallest}; {advice}")
     if width * height > LARGEST:
         raise ExemplarError(f"{path}: {width}x{height} pixels, expected at most {LARGEST >> 20} megapixels; crop or resize it")
 

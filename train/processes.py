@@ -147,9 +147,18 @@ def processes_here() -> int:
 
 
 def local_device(device: torch.device) -> torch.device:
-    """The device of this process: with torchrun, the GPU of its number on this machine."""
-    number = os.environ.get("LOCAL_RANK")
-    return torch.device(device.type, int(number)) if device.type == "cuda" and number else device
+    """The device of this process: with torchrun, the GPU of its number on this machine.
+
+    Raises TrainingError if that has fewer.
+    """
+    if device.type != "cuda" or not (rank := os.environ.get("LOCAL_RANK")):
+        return device
+    number = int(rank)
+    if number >= (gpus := torch.cuda.device_count()):
+        raise TrainingError(
+            f"process {number} of this machine has no GPU: torch sees {gpus}; start as many, or add --device cpu"
+        )
+    return torch.device(device.type, number)
 
 
 def _first_sentence(error: Exception) -> str:

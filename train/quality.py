@@ -117,8 +117,11 @@ def distinct(squares: list[Tensor]) -> list[Tensor]:
     seen = torch.cat([square[..., ::step, ::step].flatten(1) for square in squares])
     apart = torch.cdist(seen, seen, p=1)
     typical = apart[torch.ones_like(apart).triu(1).bool()].median()
-    repeats = (apart < REPEATED * typical).tril(-1).any(1).tolist()
-    return [square for square, repeat in zip(squares, repeats, strict=True) if not repeat]
+    kept: list[int] = []
+    for number in range(len(squares)):
+        if all(apart[number, other] >= REPEATED * typical for other in kept):
+            kept.append(number)
+    return [squares[number] for number in kept]
 
 
 def spread_out(squares: list[Tensor], count: int) -> list[Tensor]:

@@ -224,13 +224,17 @@ def pixels_sha256(pixels: np.ndarray[Any, Any]) -> str:
 
 
 def source_revision() -> str:
-    """The version of solidgrain, with the git revision where it runs from a checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    """The version of solidgrain, with the git revision where it runs from a checkout of its own."""
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(Path(__file__).parent), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
     try:
-        described = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        git("ls-files", "--error-unmatch", Path(__file__).name)  # installed below someone else's checkout, it is not tracked
+        return f"{version('solidgrain')} ({git('describe', '--always', '--dirty')})"
     except (OSError, subprocess.CalledProcessError):
         return version("solidgrain")
-    return f"{version('solidgrain')} ({described})"
 
 
 def _parsed(line: str) -> dict[str, Any]:

@@ -28,10 +28,6 @@ class Condition(NamedTuple):
         """y = gamma phi(...) + delta of a hidden layer, x [B, P, m] its activations."""
         return self.gamma[:, layer, None].to(x.dtype) * x + self.delta[:, layer, None].to(x.dtype)
 
-    def repeated(self, times: int) -> Condition:
-        """Each texture for that many images in a row."""
-        return Condition(*(part.repeat_interleave(times, dim=0) for part in self))
-
 
 class Octaves(nn.Module):
     """The transformation model: noise at a point through learned T_i (Eq. 1). What every sampler begins with."""

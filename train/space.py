@@ -70,9 +70,8 @@ class Space(nn.Module):
         )
 
     def forward(self, tables: Tensor, points: Tensor, patches: Tensor) -> Tensor:
-        """Colour at points [B, P, 3] of the textures of patches [G, 3, 128, 128], each for B / G images in a row: [B, P, 3]."""
-        condition = self.condition(self.encoder(patches)).repeated(len(points) // len(patches))
-        rgb: Tensor = self.sampler(tables, points, condition)
+        """Colour [B, P, 3] at points [B, P, 3] of the textures of patches [B, 3, 128, 128]."""
+        rgb: Tensor = self.sampler(tables, points, self.condition(self.encoder(patches)))
         return rgb
 
 

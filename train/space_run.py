@@ -18,6 +18,7 @@ from solidgrain.runtime.files import replacing
 from solidgrain.train.collection import Member, choose_held_out
 from solidgrain.train.run import (
     EXEMPLARS,
+    OPTIONS,
     RunFolder,
     Source,
     common_options,
@@ -62,7 +63,7 @@ def create_space_run(
     `source` gives the licence and the credit of them all. Raises TrainingError if the folder already holds a run or cannot be
     written, ExemplarError if the members cannot be trained on.
     """
-    if (folder / EXEMPLARS).exists():
+    if (folder / EXEMPLARS).exists() and not (folder / OPTIONS).exists():
         raise TrainingError(f"{folder / EXEMPLARS}: is there already, without a run; remove it or choose another --out")
     with creating(folder):
         (folder / EXEMPLARS).mkdir()

@@ -24,6 +24,11 @@ class Vgg:
     def __init__(self, device: torch.device | None = None) -> None:
         self.weights = {name: tensor.to(device) for name, tensor in _read_weights().items()}
 
+    def style(self, images: Tensor) -> list[Tensor]:
+        """What L_style compares in the paper's comparisons: images [B, 3, H, W] in [0, 1] -> activations of `STYLE_LAYERS`."""
+        activations = self.features(images, padding=1)
+        return [activations[layer] for layer in STYLE_LAYERS]
+
     def features(self, images: Tensor, padding: int = 0) -> list[Tensor]:
         """Images [B, 3, H, W] in [0, 1] -> activations [B, C, h, w] after each convolution, as many as the size allows.
 

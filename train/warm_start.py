@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.train.loop import Trainer
-from solidgrain.train.run import RunFolder, is_space, open_run, read_checkpoint
+from solidgrain.train.run import CHECKPOINT, RunFolder, is_space, open_run, read_checkpoint
 from solidgrain.train.sampler import COLORS
 from solidgrain.train.space_run import open_space_run
 
@@ -18,7 +18,12 @@ from solidgrain.train.space_run import open_space_run
 def learned(other: Path) -> dict[str, Any]:
     """The checkpoint of another run, of either kind, or a file that is one. Raises TrainingError if there is none."""
     if other.is_file():
-        return read_checkpoint(other, ("critic", "average"))
+        try:
+            return read_checkpoint(other, ("critic", "average"))
+        except TrainingError as error:
+            raise TrainingError(
+                f"--warm-start {other}: no checkpoint, or a damaged one; expected a run, or its {CHECKPOINT}"
+            ) from error
     found = (open_space_run(other) if is_space(other) else open_run(other)).load_checkpoint()
     if found is None:
         raise TrainingError(f"--warm-start {other}: no checkpoint yet; expected a run that has been trained")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 
 import numpy as np
 import OpenImageIO as oiio
@@ -62,6 +63,17 @@ def test_colours_are_not_multiplied_by_alpha(tmp_path):
     assert read_exemplar(tmp_path / "rgba.png", 64)[0, 0, 0] == pytest.approx(200 / 255, abs=1 / 255)
 
 
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+def test_a_photograph_is_turned_as_its_orientation_says(tmp_path, suffix):
+    shown = np.zeros((80, 64, 3))
+    shown[:40, :32] = 1  # bright at the top left
+    stored = {0: shown, 1: shown, 2: shown[:, ::-1], 3: np.rot90(shown, 2), 4: shown[::-1], 5: shown.swapaxes(0, 1)}
+    stored |= {6: np.rot90(shown, 1), 7: np.rot90(shown, 2).swapaxes(0, 1), 8: np.rot90(shown, -1), 9: shown}
+    for orientation, pixels in stored.items():
+        path = write(tmp_path / f"{orientation}.{suffix}", pixels, Orientation=orientation)
+        np.testing.assert_allclose(read_exemplar(path, 64), shown, atol=0.02, err_msg=str(orientation))
+
+
 def test_cmyk_is_converted(tmp_path):
     image = oiio.ImageBuf(oiio.ImageSpec(80, 80, 4, "uint8"))
     oiio.ImageBufAlgo.fill(image, (0.0, 1.0, 1.0, 0.0))  # no cyan, all magenta and yellow, no black: red
@@ -104,6 +116,13 @@ def test_a_file_that_is_no_photograph_is_refused(tmp_path, name, content, messag
         (tmp_path / name).write_bytes(content)
     with pytest.raises(ExemplarError, match=message):
         read_exemplar(tmp_path / name, 64)
+
+
+def test_a_file_whose_name_is_no_text_is_refused(tmp_path, photograph):
+    strange = os.fsencode(tmp_path) + b"/caf\xe9.png"
+    shutil.copy(photograph, strange)
+    with pytest.raises(ExemplarError, match=r"the name is not UTF-8, .* rename it"):
+        read_exemplar(os.fsdecode(strange), 64)
 
 
 def test_a_tiny_photograph_is_refused_with_the_size_that_is_needed(tmp_path):

@@ -15,7 +15,7 @@ import torch
 
 from solidgrain.runtime import TrainingError
 from solidgrain.train.loop import Trainer, train
-from solidgrain.train.processes import Processes, joined
+from solidgrain.train.processes import Processes, joined, local_device
 from solidgrain.train.settings import Budget
 from solidgrain.train.space_run import open_space_run
 from solidgrain.train.warm_start import learned, warm_start
@@ -194,3 +194,15 @@ def test_a_signal_to_torchrun_stops_both_processes_and_leaves_a_checkpoint(tmp_p
     state = open_space_run(folder).load_checkpoint()
     assert len(state["other_generators"]) == 1
     assert losses(folder)[-1]["iteration"] == state["iteration"]
+
+
+def test_each_process_has_the_gpu_of_its_number(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    cuda = torch.device("cuda")
+    assert local_device(cuda) == cuda
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert local_device(cuda) == torch.device("cuda", 1)
+    assert local_device(CPU) == CPU
+    monkeypatch.setenv("LOCAL_RANK", "2")
+    with pytest.raises(TrainingError, match=r"process 2 of this machine has no GPU: torch sees 2; .* --device cpu"):
+        local_device(cuda)

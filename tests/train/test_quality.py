@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +13,7 @@ pytest.importorskip(
     "stlpips_pytorch", reason="the VGG-16 weights come with stlpips-pytorch: pip install 'solidgrain[evaluate]'"
 )
 
+from solidgrain.export import evaluation as evaluation_module
 from solidgrain.export.figures import make_figures
 from solidgrain.runtime import ExemplarError, load_space
 from solidgrain.train.copying import Copying
@@ -117,6 +121,30 @@ def test_the_command_measures_a_bundle_and_writes_its_card(solidgrain, toy_folde
     assert (folder / "card.md").read_text().count("## Quality") == 1
 
 
+def test_a_card_that_cannot_be_written_is_one_line_after_the_figures(solidgrain, toy_folder, tmp_path, monkeypatch):
+    cells.write_png(tmp_path / "exemplar.png", EXEMPLAR[:64, :64])
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(evaluation_module, "replacing", full)
+    outcome = solidgrain(
+        "evaluate", toy_folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card", "--threads", 1
+    )
+    assert (outcome.code, torch.get_num_threads()) == (1, 1)
+    assert "| vgg_frechet |" in outcome.out
+    assert f"{toy_folder / 'card.md'}: cannot write the model card (No space left on device)" in outcome.err
+
+
+def test_a_photograph_that_is_too_small_to_measure_by_is_refused_with_flags_that_are_there(solidgrain, toy_folder, tmp_path):
+    cells.write_png(tmp_path / "small.png", blotches(100, 100))
+    outcome = solidgrain("evaluate", toy_folder, "--exemplar", tmp_path / "small.png", "--patch-scale", 2)
+    assert outcome.code == 1
+    assert outcome.error.endswith(
+        "100x100 pixels, expected at least 128x128; use a larger photograph or a smaller --patch-scale"
+    )
+
+
 def test_a_card_is_not_that_of_one_texture_of_a_space(solidgrain, toy_space_folder, tmp_path):
     texture = load_space(toy_space_folder).encode(blotches(128, 128), "blotches")
     texture.save(tmp_path / "blotches.sgt.npz")
@@ -167,6 +195,13 @@ def test_crops_that_repeat_each_other_count_once():
     assert all(torch.equal(a, b) for a, b in zip(left, squares, strict=True))
     assert len(distinct(squares)) == 4
     assert len(distinct(disjoint_crops(torch.tile(image[..., :64, :64], (2, 2)), 64))) == 4  # no two differ: evaluate says so
+
+
+def test_of_a_gradient_there_are_always_crops_to_compare():
+    ramp = torch.linspace(0, 1, 64 * 50).expand(1, 3, 64, -1)  # each crop is near the one before it
+    left = distinct(disjoint_crops(ramp, 64))
+    assert 2 <= len(left) < 50
+    assert left[0].mean() < left[-1].mean() - 0.5
 
 
 def test_inception_weights_that_are_missing_are_noticed_before_measuring(solidgrain, toy_folder, tmp_path):

@@ -310,6 +310,12 @@ def test_exemplars_that_are_there_already_are_not_overwritten(tmp_path):
     assert inside(tmp_path / "run") == {mine.relative_to(tmp_path / "run"): b"mine"}
 
 
+def test_a_run_that_is_there_already_is_not_to_be_removed(tmp_path):
+    new_space(tmp_path / "run")
+    with pytest.raises(TrainingError, match="already holds a run; continue it with --resume"):
+        new_space(tmp_path / "run")
+
+
 def swap(path):
     pixels = np.load(path)
     np.save(path, pixels[::-1])

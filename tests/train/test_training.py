@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 
 import numpy as np
 import OpenImageIO as oiio
@@ -18,7 +20,8 @@ from solidgrain.export.evaluation import scale_of
 from solidgrain.export.from_run import check_agreement, export_run, sampler_weights
 from solidgrain.runtime import BundleError, TrainingError, load
 from solidgrain.runtime.bundle import open_bundle
-from solidgrain.train import command
+from solidgrain.train import command, loop
+from solidgrain.train import run as run_module
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, open_run
@@ -250,6 +253,33 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, photograph):
     assert f"solidgrain train --resume {folder}" in err
     done = open_run(folder).load_checkpoint()["iteration"]
     assert losses(folder)[-1]["iteration"] == done
+
+
+def test_who_cannot_wait_for_the_last_save_is_told_how_to_go_on(tmp_path, photograph, solidgrain, monkeypatch):
+    new_run(tmp_path / "run", photograph)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop, "train", interrupted)
+    outcome = solidgrain("train", "--resume", tmp_path / "run", "--threads", 1)
+    assert outcome.code == 130
+    assert outcome.err.endswith(
+        f"interrupted; go on from its last checkpoint with: solidgrain train --resume {tmp_path / 'run'}\n"
+    )
+
+
+def test_below_the_checkout_of_another_project_the_revision_is_the_version_alone(tmp_path, monkeypatch):
+    installed = tmp_path / ".venv" / "run.py"
+    installed.parent.mkdir()
+    installed.touch()
+    author = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for words in (("init", "-q"), (*author, "commit", "-q", "--allow-empty", "-m", "a")):
+        subprocess.run(["git", "-C", tmp_path, *words], check=True)
+    monkeypatch.setattr(run_module, "__file__", str(installed))
+    assert run_module.source_revision() == version("solidgrain")
+    subprocess.run(["git", "-C", tmp_path, "add", installed], check=True)
+    assert re.fullmatch(r"\S+ \([0-9a-f]{7,}-dirty\)", run_module.source_revision())
 
 
 def test_who_resumes_with_another_budget_is_told_it_again(tmp_path, photograph, solidgrain, monkeypatch):

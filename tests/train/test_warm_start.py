@@ -140,7 +140,9 @@ def test_the_command_line_says_how_much_it_took_over(solidgrain, tmp_path, singl
     assert open_run(tmp_path / "c").load_checkpoint()["iteration"] == 1
 
 
-@pytest.mark.parametrize("what", ["no run", "no checkpoint", "a damaged checkpoint", "another width", "itself"])
+@pytest.mark.parametrize(
+    "what", ["no run", "no checkpoint", "a damaged checkpoint", "no checkpoint at all", "another width", "itself"]
+)
 def test_a_failed_warm_start_is_one_line_and_leaves_no_run_behind(solidgrain, tmp_path, single, what):
     other, message = single.folder, "no layer of its sampler fits"
     if what == "no run":
@@ -151,6 +153,9 @@ def test_a_failed_warm_start_is_one_line_and_leaves_no_run_behind(solidgrain, tm
     elif what == "a damaged checkpoint":
         (other / "checkpoint.pt").write_bytes(b"hello")
         message = "damaged checkpoint"
+    elif what == "no checkpoint at all":
+        other = single.folder / "exemplar.npy"
+        message = f"--warm-start {other}: no checkpoint, or a damaged one; expected a run, or its checkpoint.pt"
     else:
         settings.PRESETS["fast space"] = preset("fast space", width=32)
     out = other if what == "itself" else tmp_path / "run"
