@@ -117,10 +117,14 @@ def parse_shard(text: str) -> tuple[int, int]:
     return int(number), int(count)
 
 
+FINEST_SCALE, COARSEST_SCALE = 0.01, 1000.0  # one pixel becomes a patch of 128; no photograph that is read has more
+
+
 def parse_scale(text: str) -> float:
     numbers = _numbers(text, 1)
-    if not numbers or numbers[0] <= 0:
-        raise argparse.ArgumentTypeError(f"expected pixels of the photograph per texture pixel, above 0, found {text!r}")
+    if not numbers or not FINEST_SCALE <= numbers[0] <= COARSEST_SCALE:
+        between = f"from {FINEST_SCALE:g} to {COARSEST_SCALE:g}"
+        raise argparse.ArgumentTypeError(f"expected pixels of the photograph per texture pixel, {between}, found {text!r}")
     return numbers[0]
 
 

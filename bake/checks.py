@@ -8,11 +8,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from solidgrain.bake.engines import ATLASES
 from solidgrain.bake.manifest import is_complete, manifest_path, own_manifest
 from solidgrain.bake.plan import Plan, format_bytes, format_size
 from solidgrain.bake.staging import discard_staging, is_begun, is_foreign, staged_bytes, staging_folder
-from solidgrain.bake.writers import Output, check_output, output_bytes, output_exists, output_files, scratch_bytes
+from solidgrain.bake.writers import PREVIEW, Output, check_output, output_bytes, output_exists, output_files, scratch_bytes
 from solidgrain.runtime.errors import BakeError, UsageError
+
+THROUGH_OIIO = (*ATLASES, PREVIEW)  # kinds
 
 
 def check_plan(plan: Plan, overwrite: bool, begun: Sequence[Output] = (), shard: tuple[int, int] | None = None) -> None:
@@ -24,6 +27,7 @@ def check_plan(plan: Plan, overwrite: bool, begun: Sequence[Output] = (), shard:
     for output in plan.outputs:
         check_output(output, plan.volume)
         _check_folder(output.path)
+        _check_text(output)
     _check_memory(plan)  # before any list as long as the volume is made
     _check_disk(plan, shard)
     taken: set[Path] = set()
@@ -65,7 +69,7 @@ def _check_file(path: Path, overwrite: bool, taken: set[Path]) -> None:
     if path.is_dir():
         raise BakeError(f"{path}: is a folder, expected a file name")
     if not overwrite and path.exists():
-        raise BakeError(f"{path}: already exists; use --overwrite to replace it or --no-clobber to keep it")
+        raise BakeError(f"{path}: already exists; use --overwrite to replace it (or, of bake, --no-clobber to keep it)")
 
 
 def _check_name(path: Path, taken: set[Path]) -> None:
@@ -82,6 +86,15 @@ def _check_own(output: Path, taken: set[Path]) -> None:
     if manifest.is_dir() or (staging.exists() and not staging.is_dir()):
         wrong = manifest if manifest.is_dir() else staging
         raise BakeError(f"{wrong}: is in the way of what a bake of {output.name} keeps there; move it")
+
+
+def _check_text(output: Output) -> None:
+    """OpenImageIO takes names as text."""
+    try:
+        if output.kind in THROUGH_OIIO:
+            os.fspath(output.path).encode()
+    except UnicodeEncodeError as error:
+        raise BakeError(f"{output.path}: the name is not UTF-8, with which OpenImageIO writes no file; rename it") from error
 
 
 def _check_folder(path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import re
 import signal
@@ -58,6 +59,8 @@ class Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line. Returns the exit code."""
     arguments = _glue_negative(list(sys.argv[1:] if argv is None else argv))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # file names that are not UTF-8 leave as they came
     try:
         return _run(arguments)
     except KeyboardInterrupt:
@@ -93,6 +96,8 @@ def _run(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         return _missing(error, options.command)
     except OSError as error:
+        if isinstance(error, FileNotFoundError) and error.filename is None:  # os.getcwd
+            return _fail("the working folder is no longer there; change to another one")
         if error.filename is None:  # stdout: a closed pipe, a full device
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains once more on exit
             return _fail(f"cannot print the result ({error.strerror})")

@@ -22,7 +22,7 @@ from solidgrain.bake.arguments import (
     parse_vector,
 )
 from solidgrain.bake.distributed import parse_cluster
-from solidgrain.runtime.errors import UsageError
+from solidgrain.runtime.errors import EvaluationError, UsageError
 
 if TYPE_CHECKING:
     from solidgrain.bake.plan import Plan
@@ -142,7 +142,10 @@ def make_plan(arguments: argparse.Namespace, texture: Texture) -> Plan:
         samples=arguments.samples or 1,
         bundle=arguments.bundle and located(arguments.bundle),
     )
-    check_place(plan, texture)
+    try:
+        check_place(plan, texture)
+    except EvaluationError as error:
+        raise UsageError(f"--size, --origin, --spacing, --transform and --tile: {error}") from error
     return plan
 
 

@@ -1,7 +1,7 @@
 """Many bakes from one file: `--jobs jobs.json` (or .toml).
 
-A job's keys are the flags of `solidgrain bake` with `_` for `-`, and `name` and `texture`; `defaults` hold for all jobs. An
-output is a file name, or an object with `path` and settings of its format. Relative paths are relative to the job file's
+A job's keys are the flags of `solidgrain bake` with `_` for `-`, and `name` and `texture`; `defaults` hold for all jobs that have a
+use for them. An output is a file name, or an object with `path` and settings of its format. Relative paths are relative to the job file's
 folder. All jobs are checked before the first is baked.
 """
 
@@ -89,8 +89,25 @@ def read_jobs(path: Path, work: argparse.Namespace) -> list[Job]:
         if any(job.name == own["name"] for job in jobs):
             raise UsageError(f"{where}: another job has this name, give each its own")
         with _named(where):
-            jobs.append(_read_job(parser, {**defaults, **own}, where, path.parent, work))
+            jobs.append(_read_job(parser, {**_of_use(defaults, own), **own}, where, path.parent, work))
     return jobs
+
+
+def _of_use(defaults: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """The defaults that a job has a use for: not the settings of formats that it does not write."""
+    from solidgrain.bake.writers import formats, kind_of
+
+    paths = [Path(output["path"]) for output in _outputs({**defaults, **own})]
+    written = {formats()[kind_of(path)].name for path in paths}
+    others = (row for row in formats().values() if row.name not in written)
+    unused = {f"{row.name}_{option.name}".replace("-", "_") for row in others for option in row.options}
+    return {key: value for key, value in defaults.items() if key not in unused}
+
+
+def _outputs(values: dict[str, Any]) -> list[dict[str, Any]]:
+    """A job's outputs, each with its path and settings."""
+    given = values.get("out", [])
+    return [{"path": out} if isinstance(out, str) else dict(out) for out in (given if isinstance(given, list) else [given])]
 
 
 def _read_job(parser: JobParser, values: dict[str, Any], where: str, folder: Path, work: argparse.Namespace) -> Job:
@@ -100,10 +117,7 @@ def _read_job(parser: JobParser, values: dict[str, Any], where: str, folder: Pat
     )
     arguments.source = _source(values.get("texture"), folder)
     arguments.bundle = _source(values.get("bundle"), folder)
-    given = values.get("out", [])
-    outputs: list[dict[str, Any]] = [
-        {"path": out} if isinstance(out, str) else dict(out) for out in (given if isinstance(given, list) else [given])
-    ]
+    outputs = _outputs(values)
     settings = {folder / out.pop("path"): out for out in outputs}
     if len(settings) < len(outputs):
         raise UsageError("out: two outputs have the same name")
@@ -132,7 +146,7 @@ def _flat(value: Any) -> Iterator[Any]:
         for part in value:
             yield from _flat(part)
     else:
-        yield value
+        yield int(value) if isinstance(value, float) and value.is_integer() else value  # JSON does not tell 64 from 64.0
 
 
 def _source(name: str | None, folder: Path) -> str | None:
@@ -171,11 +185,15 @@ def plan_jobs(
 
 def _with_settings(plan: Plan, job: Job) -> Plan:
     """The plan with what the job says of single outputs."""
+    from solidgrain.bake.engines import axes_for
     from solidgrain.bake.schema import checked_output
 
-    outputs = (
-        checked_output(output, f"out {output.path.name}", **job.settings.get(output.path, {})) for output in plan.outputs
-    )
+    outputs = []
+    for output in plan.outputs:
+        own = job.settings.get(output.path, {})
+        if own.get("engine") and "axes" not in own:
+            own = {**own, "axes": axes_for(str(own["engine"]), output.kind)}
+        outputs.append(checked_output(output, f"out {output.path.name}", **own))
     return replace(plan, outputs=tuple(outputs))
 
 
@@ -238,9 +256,19 @@ def _line(one: Planned, status: str, **values: Any) -> dict[str, Any]:
 
 @contextmanager
 def _named(where: str) -> Iterator[None]:
-    """Errors that say which job they are about."""
+    """Errors that say which job they are about, and call its settings as it does: mip_filter, not --mip-filter."""
     try:
         yield
     except SolidgrainError as error:
         kind = UsageError if isinstance(error, UsageError) else BakeError
-        raise kind(f"{where}: {error}") from error
+        raise kind(f"{where}: {_with_keys(str(error))}") from error
+
+
+def _with_keys(message: str) -> str:
+    keys = {*JobParser().keys, *OWN}
+
+    def key(flag: re.Match[str]) -> str:
+        name = flag[1].replace("-", "_")
+        return name if name in keys else flag[0]
+
+    return re.sub(r"(?<!\S)--([a-z][a-z-]*)", key, message)

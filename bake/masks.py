@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tokenize
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from solidgrain.runtime.errors import BakeError, UsageError
 
 Vector = tuple[float, float, float]
+DAMAGED_ARRAY = (OSError, ValueError, EOFError, SyntaxError, tokenize.TokenError)  # what NumPy raises for an .npy that is none
 
 
 class MaskFile(NamedTuple):
@@ -35,7 +37,7 @@ def read_mask(path: Path) -> MaskFile:
         return _image_data(path)
     try:
         return MaskFile(np.load(path, mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
+    except DAMAGED_ARRAY as error:
         raise BakeError(f"--mask {path}: not readable as a NumPy array") from error
 
 

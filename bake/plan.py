@@ -94,7 +94,7 @@ class Plan:
     def to_json(self) -> dict[str, Any]:
         """The plan as plain data, with the hash that names the work."""
         values: dict[str, Any] = {"format_version": FORMAT_VERSION, **json.loads(json.dumps(asdict(self), default=str))}
-        return {**values, "hash": hash_of(values)}
+        return {"hash": hash_of(values), **values}  # first: without its line, the file is still JSON
 
 
 def plan_from_json(values: dict[str, Any]) -> Plan:

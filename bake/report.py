@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from solidgrain.bake.baker import Baked
+from solidgrain.bake.baker import Baked, Shard
 from solidgrain.bake.plan import Plan, format_bytes, format_size
 from solidgrain.bake.writers import output_bytes
 from solidgrain.runtime import Texture
 
 
-def describe(plan: Plan, texture: Texture) -> dict[str, Any]:
-    """What a bake would take: bytes per output, memory, and seconds from a short run of the sampler."""
+def describe(plan: Plan, texture: Texture, shard: Shard | None = None) -> dict[str, Any]:
+    """What a bake would take: bytes per output, memory, and seconds, of its shard alone, from a short run of the sampler."""
     rate = measure_rate(texture, plan.seed) / plan.samples
     return {
         "plan": plan.to_json(),
@@ -24,12 +24,19 @@ def describe(plan: Plan, texture: Texture) -> dict[str, Any]:
         "bytes_at_most": {str(output.path): output_bytes(output, plan.volume) for output in plan.outputs},
         "color_encoding": {str(output.path): output.colorspace for output in plan.outputs},
         "memory_bytes": plan.memory,
-        "seconds": round(plan.volume.voxels / rate, 3),
+        "seconds": round(voxels_of(plan, shard) / rate, 3),
         "provider": texture.provider,
         "provider_note": texture.provider_note,
         "threads": texture.threads,
         "tile_distortion": tile_distortion(plan, texture),
     }
+
+
+def voxels_of(plan: Plan, shard: Shard | None, without: int = 0) -> int:
+    """The voxels of a shard, or of the volume, without so many slices."""
+    width, height, depth = plan.size
+    first, stop = shard or (0, depth)
+    return width * height * (stop - first - without)
 
 
 def measure_rate(texture: Texture, seed: int) -> float:
@@ -73,7 +80,7 @@ def tiling_line(tile: str, distortion: Sequence[float]) -> str:
     return f"{tile}; octaves move by {min(distortion):.1%} to {max(distortion):.1%}"
 
 
-def result(plan: Plan, texture: Texture, baked: Baked) -> dict[str, Any]:
+def result(plan: Plan, texture: Texture, baked: Baked, shard: Shard | None = None) -> dict[str, Any]:
     """What `--json` prints after a bake."""
     return {
         "plan": plan.to_json(),
@@ -83,7 +90,7 @@ def result(plan: Plan, texture: Texture, baked: Baked) -> dict[str, Any]:
         "tile_distortion": tile_distortion(plan, texture),
         "seconds": round(baked.seconds, 3),
         "evaluation_seconds": round(baked.evaluation_seconds, 3),
-        "voxels_per_second": round(plan.volume.voxels / baked.seconds) if baked.seconds else None,
+        "voxels_per_second": round(voxels_of(plan, shard, baked.reused_slices) / baked.seconds) if baked.seconds else None,
         "reused_slices": baked.reused_slices,
         "peak_memory_bytes": peak_memory(),
     }
@@ -121,13 +128,13 @@ class Progress:
         if self.terminal and not self.quiet:
             sys.stderr.write("\n")
 
-    def finish(self, plan: Plan, texture: Texture, baked: Baked, slices: int) -> None:
+    def finish(self, plan: Plan, texture: Texture, baked: Baked, shard: Shard | None) -> None:
         if self.quiet:
             return
-        if not slices:
+        if not voxels_of(plan, shard):
             sys.stderr.write(f"{plan.texture}: no slabs in this share\n")
             return
-        rate = plan.volume.voxels * (slices - baked.reused_slices) / plan.size[2] / baked.seconds / 1e6
+        rate = voxels_of(plan, shard, baked.reused_slices) / baked.seconds / 1e6
         reused = f", {baked.reused_slices} slices were there" if baked.reused_slices else ""
         sys.stderr.write(f"{plan.texture}: {len(baked.files)} files in {baked.seconds:.1f} s, {rate:.2f} Mvoxel/s{reused}\n")
         if distortion := tile_distortion(plan, texture):

@@ -15,8 +15,8 @@ from solidgrain.runtime.files import temporary_name
 
 def sequence_files(out: Path, count: int, name: str) -> list[Path]:
     """The files of so many textures: of a frame pattern, or called `name` in a folder. Raises UsageError."""
-    if out.is_dir():
-        out /= f"{name}{TEXTURE_SUFFIX}" if count == 1 else f"{name}.####{TEXTURE_SUFFIX}"
+    if out.is_dir():  # whatever the name is, it is no pattern
+        return [out / f"{name}{f'.{k:04d}' * (count > 1)}{TEXTURE_SUFFIX}" for k in range(count)]
     if count > 1 and len(PATTERN.findall(out.name)) != 1:
         example = f"{out.name.removesuffix(TEXTURE_SUFFIX)}.####{TEXTURE_SUFFIX}"
         raise UsageError(f"--out {out}: expected a frame pattern for {count} textures, such as {example}, or a folder")

@@ -230,6 +230,8 @@ def open_staging(
             staging.empty()
         check_work(output, work)
     except BaseException:
+        if fresh:
+            staging.clear()
         staging.close()
         raise
     return staging

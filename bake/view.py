@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from solidgrain.bake.masks import DAMAGED_ARRAY
 from solidgrain.bake.opengl import has_display, off_screen_environment, require_opengl
 from solidgrain.runtime.errors import ViewError
 from solidgrain.runtime.files import temporary_name
@@ -48,7 +49,7 @@ def _from_array(path: Path) -> pyvista.ImageData:
 
     try:
         array = np.load(path, allow_pickle=False, mmap_mode="r")
-    except (OSError, ValueError, EOFError) as error:
+    except DAMAGED_ARRAY as error:
         raise ViewError(f"{path}: not readable as a NumPy array") from error
     if array.ndim != 4 or array.shape[-1] != 3 or array.size == 0 or array.dtype.kind not in "fu":
         raise ViewError(

@@ -138,13 +138,14 @@ def make_mask(values: npt.ArrayLike, origin: Vector = (0.0, 0.0, 0.0), spacing: 
         raise EvaluationError(f"mask of {array.dtype}: expected floats from 0 to 1, booleans, uint8 or uint16")
     array = np.array(array, array.dtype.name, order="C", copy=True if array.flags.writeable else None)
     if array.dtype.kind == "f":
-        least, most = min(float(plane.min()) for plane in array), max(float(plane.max()) for plane in array)
+        extremes = np.array([(plane.min(), plane.max()) for plane in array])  # NaN stays NaN in these, not in Python's own
+        least, most = extremes.min(), extremes.max()
         if not (least >= 0 and most <= 1):
             raise EvaluationError(f"mask has values from {least:g} to {most:g}, expected 0 to 1 (0: the first texture)")
     array.flags.writeable = False
-    if not np.isfinite([*origin, *spacing]).all() or min(spacing) <= 0:
+    if not np.isfinite([*origin, *spacing]).all() or min(spacing) < FINEST:
         raise EvaluationError(
-            f"mask at {origin} with voxels of {spacing}: expected a place and sizes above 0, in exemplar pixels"
+            f"mask at {origin} with voxels of {spacing}: expected a place and sizes of {FINEST:g} or more, in exemplar pixels"
         )
     return Mask(array, origin, spacing)
 

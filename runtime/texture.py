@@ -82,6 +82,8 @@ def _resolve(source: str, bundle: str | None) -> tuple[TextureData | BlendData, 
             )
         return data, open_bundle(folder)
     owner = open_bundle(bundle_folder(source))
+    if bundle is not None:
+        raise BundleError(f"{source}: is a bundle itself, and --bundle is about texture files; leave {bundle} out")
     if owner.is_space:
         raise BundleError(
             f"{source}: is a space, which holds no texture of its own; "
@@ -316,7 +318,8 @@ def _whole(name: str, values: Sequence[int], count: int, least: int) -> tuple[in
         numbers = ()
     if len(numbers) != count or min(numbers) < least or max(numbers) > LARGEST:
         plural = "s" * (count > 1)
-        raise EvaluationError(f"{name} {values}: expected {count} whole number{plural} from {least} to {LARGEST}")
+        found = values[0] if count == 1 else values
+        raise EvaluationError(f"{name} {found}: expected {count} whole number{plural} from {least} to {LARGEST}")
     return numbers
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from solidgrain.bake.arguments import parse_count, parse_positive, parse_seconds, parse_seed
 from solidgrain.bake.flags import add_cut
+from solidgrain.bake.messages import tell, tell_next
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.space import DEFAULT_SPACE
 from solidgrain.train.command import INTERRUPTED, choose_device
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     progress.end()
     if found.iterations == 0:
-        print(f"stopped before the first iteration; {arguments.out} is not written", file=sys.stderr)
+        tell(f"stopped before the first iteration; {arguments.out} is not written")
         return INTERRUPTED
     space.open(found.texture).save(arguments.out)
     say(found, space, arguments)
@@ -129,18 +129,16 @@ def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData
 
     photograph = read_photograph(arguments.photo, 1)
     if photograph.warning:
-        print(f"warning: {arguments.photo}: {photograph.warning}", file=sys.stderr)
+        tell(f"warning: {arguments.photo}: {photograph.warning}")
     cut = Cut(arguments.patch_scale, arguments.crop)
     patch, note = cut_patch(photograph.pixels, space.patch, cut, str(arguments.photo))
-    print(note, file=sys.stderr)
+    tell(note)
     start = space.own(space.encode(patch, arguments.photo.stem, cut.scale or 1.0))
     return start, patch if cut.corner else scaled(photograph.pixels, cut.scale or 1.0)
 
 
 def say(found: Adapted, space: Space, arguments: argparse.Namespace) -> None:
     """What came of it."""
-    from solidgrain.runtime.bundle import find_bundle
-
     report = {
         "texture": str(arguments.out),
         "name": found.texture.name,
@@ -159,10 +157,9 @@ def say(found: Adapted, space: Space, arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(json.dumps(report, indent=2))
     if found.ended == "diverged":
-        print(f"warning: L_style diverged at iteration {found.iterations}; the best before that is kept", file=sys.stderr)
+        tell(f"warning: L_style diverged at iteration {found.iterations}; the best before that is kept")
     if found.end >= found.start:
-        print("warning: L_style has not fallen; the texture is the one that the encoder gives", file=sys.stderr)
+        tell("warning: L_style has not fallen; the texture is the one that the encoder gives")
     spent = f"{found.iterations} iterations, {found.seconds:.0f} s"
-    print(f"L_style {found.start:.4f} -> {found.end:.4f}, {spent} ({WHY[found.ended]})", file=sys.stderr)
-    bundle = "" if find_bundle(found.texture.sampler_sha256, arguments.out.parent) else f" --bundle {arguments.bundle}"
-    print(f"{arguments.out}: next: solidgrain bake {arguments.out}{bundle} --size 128 --out out.vti", file=sys.stderr)
+    tell(f"L_style {found.start:.4f} -> {found.end:.4f}, {spent} ({WHY[found.ended]})")
+    tell_next(arguments.out, found.texture.sampler_sha256, arguments.bundle)

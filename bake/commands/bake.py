@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from solidgrain.bake.flags import add_arguments, make_plan
+from solidgrain.bake.messages import tell, tell_error
 from solidgrain.bake.modes import check_modes
 from solidgrain.bake.sources import Encoded
 from solidgrain.runtime.errors import UsageError
@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_modes(arguments)
     if arguments.jobs:
         return run_jobs(arguments)
-    encoded = Encoded(tell_note)
+    encoded = Encoded(tell)
     encoded.settle(arguments)
     plan, texture = planned(arguments, encoded)
     if not plan.outputs and not arguments.dry_run:
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     plan = to_do(plan, arguments)
     if arguments.dry_run:
         encoded.tell_missing()
-        report = describe(plan, texture)
+        report = describe(plan, texture, plan.shard(*arguments.shard) if arguments.shard else None)
         print(json.dumps(report, indent=2) if arguments.json else summary(report))
         return 0
     try:
@@ -58,11 +58,13 @@ def planned(arguments: argparse.Namespace, encoded: Encoded) -> tuple[Plan, Text
         texture = encoded.load(arguments) or load_texture(arguments)
         return make_plan(arguments, texture), texture
     from solidgrain.bake.evaluate import check_place
+    from solidgrain.bake.plan import located
     from solidgrain.bake.schema import load_plan
     from solidgrain.bake.verify import check_texture
 
     plan = load_plan(arguments.plan)
-    plan = replace(plan, source=arguments.source or plan.source, bundle=arguments.bundle or plan.bundle)
+    source, bundle = (given and located(given) for given in (arguments.source, arguments.bundle))
+    plan = replace(plan, source=source or plan.source, bundle=bundle or plan.bundle)
     of_plan = {"source": plan.source, "bundle": plan.bundle, "precision": plan.precision}
     texture = load_texture(argparse.Namespace(**{**vars(arguments), **of_plan}))
     check_texture(plan, texture, f"--plan {arguments.plan}")
@@ -75,7 +77,7 @@ def run_jobs(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.jobs import FAILED, bake_jobs, plan_jobs, read_jobs
     from solidgrain.bake.report import describe, summary
 
-    encoded = Encoded(tell_note)
+    encoded = Encoded(tell)
     read = read_jobs(arguments.jobs, arguments)
     jobs, textures = plan_jobs(read, encoded.settle, lambda named: encoded.load(named) or load_texture(named), to_do)
     if arguments.dry_run:
@@ -91,14 +93,6 @@ def run_jobs(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps({"jobs": report}, indent=2))
     return 1 if any(job["status"] == FAILED for job in report) else 0
-
-
-def tell_error(message: str) -> None:
-    print(f"solidgrain: {message}", file=sys.stderr)
-
-
-def tell_note(line: str) -> None:
-    print(line, file=sys.stderr)
 
 
 def emit_job(plan: Plan, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -135,7 +129,7 @@ def to_do(plan: Plan, arguments: argparse.Namespace) -> Plan:
     shard = plan.shard(*arguments.shard) if arguments.shard else None
     goes_on = arguments.resume or arguments.no_clobber or shared
     check_plan(plan, anew, [output for output in plan.outputs if goes_on and is_begun(output.path)], shard)
-    if shared and not (arguments.dry_run and anew):  # it would be removed, not refused
+    if (shared or arguments.resume) and not (arguments.dry_run and anew):  # it would be removed, not refused
         for output in plan.outputs:
             clear_leftovers(output.path, plan.work(output), anew)
     return plan
@@ -159,6 +153,5 @@ def bake_plan(plan: Plan, texture: Texture, arguments: argparse.Namespace) -> di
             baked = bake(plan, texture, progress.show, resume=arguments.resume, shard=shard)
     finally:
         progress.end_line()
-    first, stop = shard or (0, plan.size[2])
-    progress.finish(plan, texture, baked, stop - first)
-    return {**result(plan, texture, baked), **details}
+    progress.finish(plan, texture, baked, shard)
+    return {**result(plan, texture, baked, shard), **details}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from solidgrain.bake.arguments import parse_length, parse_spacing, parse_steps, parse_vector
 from solidgrain.bake.flags import add_cut
+from solidgrain.bake.messages import tell, tell_next
 from solidgrain.runtime.errors import EvaluationError, UsageError
 
 if TYPE_CHECKING:
@@ -51,7 +51,6 @@ def _add_place(group: argparse._ArgumentGroup) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.sequence import check_sequence, save_together, sequence_files
     from solidgrain.runtime import load_space
-    from solidgrain.runtime.bundle import find_bundle
 
     _check_modes(arguments)
     space = load_space(arguments.bundle)
@@ -66,8 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
             for file, (place, texture) in zip(files, blends, strict=True)
         ]
         print(json.dumps({"space": space.name, "sampler_sha256": space.bundle.sampler_sha256, "textures": rows}, indent=2))
-    bundle = "" if find_bundle(space.bundle.sampler_sha256, files[0].parent) else f" --bundle {arguments.bundle}"
-    print(f"{files[0]}: next: solidgrain bake {files[0]}{bundle} --size 128 --out out.vti", file=sys.stderr)
+    tell_next(files[0], space.bundle.sampler_sha256, arguments.bundle)
     return 0
 
 
@@ -91,7 +89,7 @@ def _ends(arguments: argparse.Namespace, space: Space) -> tuple[Texture, Texture
     cut, sources = Cut(arguments.patch_scale, arguments.crop), (arguments.first, arguments.second)
     if cut != WHERE_IT_IS and not any(map(is_photograph, sources)):
         raise UsageError("--patch-scale and --crop: are about photographs, and there are none; leave them out")
-    first, second = (open_in_space(space, source, cut if is_photograph(source) else WHERE_IT_IS, _tell) for source in sources)
+    first, second = (open_in_space(space, source, cut if is_photograph(source) else WHERE_IT_IS, tell) for source in sources)
     return first, second
 
 
@@ -125,7 +123,3 @@ def _by_mask(arguments: argparse.Namespace, space: Space, first: Texture, second
     except EvaluationError as error:
         raise EvaluationError(f"--mask {arguments.mask}: {error}") from error
     return {"mask": str(arguments.mask), "origin": origin, "spacing": spacing}, texture
-
-
-def _tell(line: str) -> None:
-    print(line, file=sys.stderr)

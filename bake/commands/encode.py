@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
 from solidgrain.bake.flags import add_cut
+from solidgrain.bake.messages import tell, tell_next
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.sources import Cut, check_new, encode_photograph
     from solidgrain.runtime import load_space
-    from solidgrain.runtime.bundle import find_bundle
 
     check_new(arguments.out, arguments.overwrite)
     space = load_space(arguments.bundle)
@@ -42,11 +41,5 @@ def run(arguments: argparse.Namespace) -> int:
     }
     if arguments.json:
         print(json.dumps(report, indent=2))
-    found = find_bundle(texture.data.sampler_sha256, arguments.out.parent)
-    bundle = "" if found else f" --bundle {arguments.bundle}"
-    print(f"{arguments.out}: next: solidgrain bake {arguments.out}{bundle} --size 128 --out out.vti", file=sys.stderr)
+    tell_next(arguments.out, texture.data.sampler_sha256, arguments.bundle)
     return 0
-
-
-def tell(line: str) -> None:
-    print(line, file=sys.stderr)

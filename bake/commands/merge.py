@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from solidgrain.bake.messages import tell
 from solidgrain.runtime.errors import BakeError, UsageError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps({"plan": plan.to_json(), "files": files, "seconds": round(merged.seconds, 3)}, indent=2))
     if not arguments.quiet:
         told = f"{len(files)} files in {merged.seconds:.1f} s" if files else "nothing to merge, its files are whole"
-        print(f"{plan.texture}: {told}", file=sys.stderr)
+        tell(f"{plan.texture}: {told}")
     return 0
 
 
@@ -51,8 +51,18 @@ def find_plan(target: Path) -> Plan:
         plan = load_plan(kept)
         return replace(plan, outputs=tuple(replace(output, path=target.parent / output.path) for output in plan.outputs))
     if manifest_path(target).exists():
-        return load_plan(manifest_path(target))
+        return _moved(load_plan(manifest_path(target)), target)
     raise UsageError(f"{target}: no shard of it has been baked here; expected an output with shards, or a plan file")
+
+
+def _moved(plan: Plan, target: Path) -> Plan:
+    """A finished plan with its outputs where they are now: those that lay beside the target, beside it still."""
+    before = next((output.path.parent for output in plan.outputs if output.path.name == target.name), None)
+    outputs = (
+        replace(output, path=target.parent / output.path.name) if output.path.parent == before else output
+        for output in plan.outputs
+    )
+    return replace(plan, outputs=tuple(outputs))
 
 
 def to_merge(plan: Plan, overwrite: bool) -> Plan:

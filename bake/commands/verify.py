@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from solidgrain.bake.arguments import parse_count
+from solidgrain.bake.messages import tell_error
+
+if TYPE_CHECKING:
+    from solidgrain.bake.verify import Verified
 
 FAILED_VERIFICATION = 3
 
@@ -25,14 +31,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.verify import verify
+    from solidgrain.runtime.errors import SolidgrainError
 
     where = {name: getattr(arguments, name) for name in ("source", "bundle", "provider", "threads")}
-    found = [verify(target, arguments.voxels, **where) for target in arguments.targets]
-    if arguments.json:
+    found, failures = [], []
+    for target in arguments.targets:
+        try:
+            found.append(verify(target, arguments.voxels, **where))
+        except SolidgrainError as error:  # what is wrong with the others is to be said, too
+            failures.append(error)
+    if found:
+        show(found, arguments.json)
+    unsound = any(one.wrong for one in found)
+    for failure in failures if unsound else failures[1:]:
+        tell_error(failure)
+    if failures and not unsound:
+        raise failures[0]
+    return FAILED_VERIFICATION if unsound else 0
+
+
+def show(found: Sequence[Verified], as_json: bool) -> None:
+    """What was found, on stdout."""
+    if as_json:
         outputs = [{**asdict(one), "output": str(one.output), "sound": not one.wrong} for one in found]
         print(json.dumps({"outputs": outputs}, indent=2))
-    else:
-        for one in found:
-            compared = f"{one.voxels} voxels evaluated again" if one.voxels else "checksums only"
-            print("\n".join(one.wrong) if one.wrong else f"{one.output}: {one.files} files whole, {compared}")
-    return FAILED_VERIFICATION if any(one.wrong for one in found) else 0
+        return
+    for one in found:
+        compared = f"{one.voxels} voxels evaluated again" if one.voxels else "checksums only"
+        print("\n".join(one.wrong) if one.wrong else f"{one.output}: {one.files} files whole, {compared}")

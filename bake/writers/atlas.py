@@ -71,9 +71,7 @@ class AtlasFile(Writer):
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
         def convert(k: int) -> Bytes:
-            level = slab[k : k + 1]
-            values = self.quantized(level, z + k, np.uint8) if self.dtype == np.uint8 else self.colors(level)
-            return np.ascontiguousarray(values, self.dtype).data
+            return self.stored(slab[k : k + 1], z + k, self.dtype).data
 
         return Encoded({SLICES: self.workers.map(convert, len(slab))})
 
@@ -181,16 +179,14 @@ class AtlasFile(Writer):
         }
 
     def probe(self, voxels: npt.NDArray[np.int64]) -> tuple[FloatArray, float]:
-        tiles, colors = layout(self.output, self.volume), np.empty((len(voxels), 3), np.float32)
+        tiles, values = layout(self.output, self.volume), np.empty((len(voxels), 3), self.dtype)
         x, y, z = voxels.T
         row = z // tiles.columns * tiles.tile_height + y
         column = z % tiles.columns * tiles.tile_width + x
         lines = np.unique(row)  # downwards: what is compressed is read once
         for line, pixels in zip(lines, self._scanlines(self.output.path, [(int(y), int(y) + 1) for y in lines]), strict=True):
-            colors[row == line] = pixels[0, column[row == line]]
-        if self.dtype == np.float16:
-            return colors, 2**-11
-        return colors / np.float32(255), self.rounding / 255 + 1e-6
+            values[row == line] = pixels[0, column[row == line]]
+        return self.read_back(values)
 
 
 def import_settings(engine: str, tiles: Layout, colorspace: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -103,13 +103,22 @@ class Writer(ABC):
         """sRGB-encoded colours in the colour space of this output."""
         return from_srgb(rgb, self.output.colorspace)
 
-    @property
-    def rounding(self) -> float:
-        """How far `quantized` may move a value, in steps."""
-        return 1.5 if self.output.options["dither"] else 0.5
+    def stored(self, slab: FloatArray, z: int, dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
+        """Slices z, z + 1, ... in the colour space of this output, as floats or unsigned whole numbers."""
+        whole = np.dtype(dtype).kind == "u"
+        return np.ascontiguousarray(self.quantized(slab, z, dtype) if whole else self.colors(slab), dtype)
+
+    def read_back(self, values: npt.NDArray[Any]) -> tuple[FloatArray, float]:
+        """What `stored` made of colours, as colours, and how far it may have moved them: half an ulp, or steps' rounding."""
+        colors = values.astype(np.float32)
+        if values.dtype.kind == "f":
+            return colors, 2**-11 if values.dtype.itemsize == 2 else 1e-6
+        largest = np.iinfo(values.dtype).max
+        steps = 1.5 if self.output.options["dither"] else 0.5
+        return colors / np.float32(largest), steps / largest + 1e-6
 
     def quantized(self, slab: FloatArray, z: int, dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
-        """The same as whole numbers, 0 .. 255 or 0 .. 65535 for [0, 1], dithered if the output asks for it."""
+        """Slices z, z + 1, ... as whole numbers, 0 .. 255 or 0 .. 65535 for [0, 1], dithered if the output asks for it."""
         dither = bool(self.output.options["dither"])
         return quantize(self.colors(slab), dtype, noise=triangular(slab.shape, z) if dither else None)
 

@@ -67,7 +67,7 @@ class DdsFile(SequenceWriter):
     def _voxels(self, level: FloatArray, z: int) -> npt.NDArray[np.generic]:
         """One slice as RGBA [y, x, 4], padded to whole blocks with its edge."""
         half = self.output.options["type"] == "rgba16f"
-        rgb = self.colors(level).astype("<f2") if half else self.quantized(level, z, np.uint8)
+        rgb = self.stored(level, z, "<f2" if half else np.uint8)
         below, right = (-extent % self.pixels.block for extent in rgb.shape[1:3])
         rgb = np.pad(rgb[0], ((0, below), (0, right), (0, 0)), mode="edge")
         opaque = np.full((*rgb.shape[:2], 1), 1 if half else 255, rgb.dtype)
@@ -108,10 +108,7 @@ class DdsFile(SequenceWriter):
         dtype = "<f2" if self.pixels.unit_bytes == 8 else "u1"
         stored = np.memmap(self.output.path, dtype, "r", HEADER_BYTES, (*self.volume.shape, 4))
         x, y, z = voxels.T
-        colors = stored[z, y, x, :3].astype(np.float32)
-        if dtype == "<f2":
-            return colors, 2**-11
-        return colors / np.float32(255), self.rounding / 255 + 1e-6
+        return self.read_back(stored[z, y, x, :3])
 
 
 def header(output: Output, volume: Volume, mips: int) -> bytes:

@@ -30,9 +30,7 @@ class RawFile(SequenceWriter):
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
         def convert(k: int) -> Bytes:
-            level = slab[k : k + 1]
-            values = self.quantized(level, z + k, self.dtype) if self.dtype.kind == "u" else self.colors(level)
-            return np.ascontiguousarray(values, self.dtype).data
+            return self.stored(slab[k : k + 1], z + k, self.dtype).data
 
         return data(*self.workers.map(convert, len(slab)))
 
@@ -54,11 +52,7 @@ class RawFile(SequenceWriter):
     def probe(self, voxels: npt.NDArray[np.int64]) -> tuple[FloatArray, float]:
         stored = np.memmap(self.output.path, self.dtype, "r", shape=(*self.volume.shape, 3))
         x, y, z = voxels.T
-        colors = stored[z, y, x].astype(np.float32)
-        if self.dtype.kind == "f":
-            return colors, 2**-11 if self.dtype.itemsize == 2 else 1e-6
-        largest = np.iinfo(self.dtype).max
-        return colors / np.float32(largest), self.rounding / largest + 1e-6
+        return self.read_back(stored[z, y, x])
 
 
 def provenance(output: Output, volume: Volume) -> dict[str, Any]:

@@ -30,6 +30,10 @@ class VtiFile(SequenceWriter):
     """The header's length is known beforehand; the table of compressed sizes in it is not, until all slabs have come."""
 
     @property
+    def dtype(self) -> np.dtype[Any]:
+        return np.dtype(str(self.output.options["type"])).newbyteorder("<")
+
+    @property
     def compressed(self) -> bool:
         return self.output.options["compression"] == "zlib"
 
@@ -40,18 +44,13 @@ class VtiFile(SequenceWriter):
 
     def encode(self, z: int, slab: FloatArray) -> Encoded:
         def convert(k: int) -> Bytes:
-            level = self._values(slab[k], z + k).data
+            level = self.stored(slab[k : k + 1], z + k, self.dtype).data
             return zlib.compress(level, LEVEL) if self.compressed else level
 
         levels = self.workers.map(convert, len(slab))
         if not self.compressed:
             return Encoded({DATA: levels})
         return Encoded({DATA: levels, SIZES: [np.array([memoryview(level).nbytes for level in levels], "<u8").data]})
-
-    def _values(self, level: FloatArray, z: int) -> npt.NDArray[Any]:
-        dtype = self.output.options["type"]
-        values = self.colors(level) if dtype == "float32" else self.quantized(level[None], z, np.dtype(str(dtype)))
-        return np.ascontiguousarray(values, np.dtype(str(dtype)).newbyteorder("<"))
 
     def header(self, store: Store) -> bytes:
         depth = self.volume.shape[0]
@@ -65,8 +64,7 @@ class VtiFile(SequenceWriter):
 
     def probe(self, voxels: npt.NDArray[np.int64]) -> tuple[FloatArray, float]:
         depth, height, width = self.volume.shape
-        dtype = np.dtype(str(self.output.options["type"])).newbyteorder("<")
-        values = np.empty((len(voxels), 3), np.float32)
+        values = np.empty((len(voxels), 3), self.dtype)
         with open(self.output.path, "rb") as file:
             file.seek(self.reserved - 8 * depth if self.compressed else 0)
             sizes = np.frombuffer(file.read(8 * depth), "<u8") if self.compressed else np.full(depth, self._slice_bytes)
@@ -74,13 +72,10 @@ class VtiFile(SequenceWriter):
             for z in np.unique(voxels[:, 2]):
                 file.seek(int(starts[z]))
                 content = file.read(int(sizes[z]))
-                level = np.frombuffer(zlib.decompress(content) if self.compressed else content, dtype)
+                level = np.frombuffer(zlib.decompress(content) if self.compressed else content, self.dtype)
                 here = voxels[:, 2] == z
                 values[here] = level.reshape(height, width, 3)[voxels[here, 1], voxels[here, 0]]
-        if dtype.kind == "f":
-            return values, 1e-6
-        largest = np.iinfo(dtype).max
-        return values / np.float32(largest), self.rounding / largest + 1e-6
+        return self.read_back(values)
 
     @property
     def _slice_bytes(self) -> int:

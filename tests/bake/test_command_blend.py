@@ -13,6 +13,7 @@ import pyvista
 
 from solidgrain.bake.baker import bake
 from solidgrain.bake.schema import load_plan
+from solidgrain.bake.sequence import sequence_files
 from solidgrain.export.bundle import Details, write_bundle
 from solidgrain.runtime import BundleError, Texture, load_space, load_texture
 from solidgrain.runtime.texture_file import read_texture
@@ -300,3 +301,16 @@ def test_a_sequence_that_cannot_be_written_leaves_all_as_it_was(blend, tmp_path,
     assert "no space left" in outcome.error
     assert names(tmp_path) == ["ab.0000.sgt.npz"]
     assert former.read_bytes() == b"mine"
+
+
+def test_a_folder_takes_names_that_look_like_patterns(tmp_path):
+    names = [path.name for path in sequence_files(tmp_path, 2, "s#1-q")]
+    assert names == ["s#1-q.0000.sgt.npz", "s#1-q.0001.sgt.npz"]
+    assert sequence_files(tmp_path, 1, "s#1-q") == [tmp_path / "s#1-q.sgt.npz"]
+
+
+def test_a_damaged_header_of_an_array_is_refused_in_a_line(blend, tmp_path):
+    np.save(tmp_path / "mask.npy", np.zeros((2, 2, 2), np.float32))
+    content = (tmp_path / "mask.npy").read_bytes()
+    (tmp_path / "mask.npy").write_bytes(content.replace(b"(2, 2, 2)", b"(2, 2, 2 ", 1))
+    assert "mask.npy: not readable as a NumPy array" in blend("--mask", tmp_path / "mask.npy", "--out", "m.sgt.npz").error

@@ -205,3 +205,39 @@ def test_an_extra_that_a_commands_flags_need_is_named(solidgrain, monkeypatch):
     outcome = solidgrain("bake", "--help")
     assert outcome.code == 1
     assert outcome.error == "solidgrain: bake needs the package isal; pip install 'solidgrain[bake]'"
+
+
+def test_a_bundle_flag_that_is_about_nothing_is_refused(solidgrain):
+    assert "granite: is a bundle itself, and --bundle is about texture files; leave nope out" in (
+        solidgrain("info", "granite", "--bundle", "nope").error
+    )
+
+
+def test_a_working_folder_that_is_gone_is_said_to_be(solidgrain, tmp_path, monkeypatch, toy_folder):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    outcome = solidgrain("bake", toy_folder, "--size", 4, "--out", "a.npy")
+    assert (outcome.code, outcome.error) == (1, "solidgrain: the working folder is no longer there; change to another one")
+
+
+def test_names_that_are_not_utf8_are_written_as_they_came_or_refused(tmp_path, toy_folder):
+    strange = os.fsencode(tmp_path) + b"/caf\xe9"
+    bake = [sys.executable, "-m", "solidgrain.bake.cli", "bake", toy_folder, "--size", "4", "--quiet"]
+    environment = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
+
+    def run(*flags):
+        return subprocess.run([*bake, *flags], env=environment, capture_output=True, check=False)
+
+    planned = run("--out", strange + b".npy", "--dry-run")
+    assert (planned.returncode, strange in planned.stdout) == (0, True), planned.stderr
+    assert run("--out", strange + b".npy").returncode == 0
+    for refused in (run("--preview", strange + b".png"), run("--out", strange + b".atlas.png")):
+        assert refused.returncode == 1
+        assert b"the name is not UTF-8, with which OpenImageIO writes no file; rename it" in refused.stderr
+
+
+@pytest.mark.parametrize("flags", [("--origin", "1e12,0,0"), ("--spacing", "1e11")])
+def test_a_grid_that_is_out_of_reach_is_a_matter_of_its_flags(solidgrain, toy_folder, tmp_path, flags):
+    outcome = solidgrain("bake", toy_folder, *flags, "--out", tmp_path / "a.npy")
+    assert (outcome.code, flags[0] in outcome.error) == (2, True), outcome.error

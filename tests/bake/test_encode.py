@@ -334,3 +334,10 @@ def test_what_is_no_photograph_is_refused(toy_space_folder, exemplar, message):
 def test_bytes_and_floats_encode_alike(toy_space_folder, pixels):
     space = load_space(toy_space_folder)
     np.testing.assert_allclose(space.code(pixels), space.code(np.round(pixels * 255).astype(np.uint8)), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", ["0.001", "1e307", "nan", "0"])
+def test_a_scale_of_no_photograph_is_refused(solidgrain, tmp_path, scale):
+    outcome = solidgrain("encode", tmp_path / "p.png", "--out", tmp_path / "p.sgt.npz", "--patch-scale", scale)
+    assert outcome.code == 2
+    assert "expected pixels of the photograph per texture pixel, from 0.01 to 1000" in outcome.error

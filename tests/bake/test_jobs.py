@@ -103,6 +103,29 @@ def test_a_setting_holds_for_all_outputs_of_its_format_and_an_outputs_own_comes_
     assert (found[2].options["type"], found[2].options["dither"]) == ("uint8", 1)
 
 
+def test_defaults_are_for_the_jobs_that_have_a_use_for_them(solidgrain, write_jobs):
+    path = write_jobs({"name": "a", "out": "a.vti"}, {"name": "b", "out": ["b.####.exr"]}, exr_compression="piz")
+    assert solidgrain("bake", "--jobs", path, "--quiet").code == 0
+    path = write_jobs({"name": "a", "out": "a.vti", "exr_compression": "piz"})
+    assert "jobs[0] 'a': exr_compression: no out of this format; leave it out" in solidgrain("bake", "--jobs", path).error
+
+
+def test_an_outputs_own_engine_turns_its_axes(solidgrain, write_jobs, tmp_path):
+    own = {"name": "a", "out": {"path": "a.atlas.png", "engine": "unity"}}
+    path = write_jobs(own, {"name": "b", "out": "b.atlas.png", "for": "unity"}, size=8)
+    assert solidgrain("bake", "--jobs", path, "--quiet").code == 0
+    axes = [json.loads((tmp_path / "show" / f"{name}.atlas.json").read_text())["axes"] for name in "ab"]
+    assert axes == ["+x-z+y"] * 2
+    path = write_jobs({"name": "a", "out": {"path": "a.dds", "engine": "unitee"}})
+    assert "unknown engine; pick one of unreal, unity, godot" in solidgrain("bake", "--jobs", path).error
+
+
+def test_whole_numbers_may_be_written_as_floats(solidgrain, write_jobs, tmp_path):
+    path = write_jobs({"name": "a", "out": "a.npy"}, size=4.0, seed=7.0)
+    assert solidgrain("bake", "--jobs", path, "--quiet").code == 0
+    assert np.load(tmp_path / "show" / "a.npy").shape == (4, 4, 4, 3)
+
+
 def test_a_switch_is_true_or_false(write_jobs):
     (on,) = outputs_of(write_jobs({"name": "a", "out": "a.####.exr", "mips": True, "mip_filter": "kaiser"}))
     (off,) = outputs_of(write_jobs({"name": "a", "out": "a.####.exr", "mips": False}))
@@ -122,7 +145,7 @@ def test_a_switch_is_true_or_false(write_jobs):
         ({"origin": [1, 2]}, "jobs[0].origin: expected three numbers"),
         ({"tile": "xw"}, "jobs[0] 'a': tile: expected each of x, y, z at most once, found 'xw'"),
         ({"box": [0, 0, 0, 1, 1, 0]}, "jobs[0] 'a': box: expected X,Y,Z,X,Y,Z"),
-        ({"box": [0, 0, 0, 1, 1, 1], "origin": [0, 0, 0]}, "jobs[0] 'a': --box: says where the grid is already"),
+        ({"box": [0, 0, 0, 1, 1, 1], "origin": [0, 0, 0]}, "jobs[0] 'a': box: says where the grid is already"),
         ({"transform": [[1, 2], [3]]}, "jobs[0].transform: expected four rows of four numbers"),
         ({"exr_compression": "lzma"}, "jobs[0] 'a': exr_compression: invalid choice: 'lzma'"),
         ({"exr_start": -1}, "jobs[0] 'a': exr_start: expected a whole number, 0 or more, found '-1'"),
@@ -136,7 +159,7 @@ def test_a_switch_is_true_or_false(write_jobs):
         ({"out": 7}, "jobs[0].out: expected a file name, an object with path and settings, or a list of those, found 7"),
         ({"out": [{"type": "half"}]}, "jobs[0].out: expected a file name"),
         ({"out": ["a.npy", "./a.npy"]}, "out: two outputs have the same name"),
-        ({"out": "a.tga"}, "jobs[0] 'a': --out show/a.tga: unknown format '.tga'"),
+        ({"out": "a.tga"}, "jobs[0] 'a': out a.tga: unknown format '.tga'"),
         ({"out": {"path": "a.vti", "type": "int4"}}, "jobs[0] 'a': out a.vti: show/a.vti: type 'int4', expected one of uint8"),
         ({"out": {"path": "a.vti", "bits": 4}}, "unknown option 'bits' of vti"),
         ({"out": {"path": "a.vti", "kind": ".npy"}}, "unknown option 'kind' of vti"),

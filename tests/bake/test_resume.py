@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from solidgrain.bake import report as report_module
+from solidgrain.bake import staging as staging_module
 from solidgrain.bake.baker import bake, merge
 from solidgrain.bake.schema import load_plan
 from solidgrain.bake.staging import open_staging, staged_bytes, staging_folder
@@ -437,6 +439,45 @@ def test_a_plan_that_is_done_leaves_the_shards_of_another_alone(solidgrain, tmp_
     assert solidgrain(*flags, flag).code == 0
     report = json.loads(solidgrain(*flags, "--seed", 1, "--resume", "--overwrite", "--json").out)
     assert report["reused_slices"] == 16
+
+
+def test_work_of_another_plan_gives_way_to_overwrite_resumed_or_not(solidgrain, tmp_path, toy_folder):
+    flags = ("bake", toy_folder, "--size", "6x5x40", "--out", tmp_path / "a.npy", "--quiet", "--resume")
+    assert solidgrain(*flags, "--seed", 1, "--shard", "1/2").code == 0
+    assert "begin anew with --overwrite" in solidgrain(*flags).error
+    assert solidgrain(*flags, "--overwrite").code == 0
+
+
+def test_figures_are_those_of_the_shard(solidgrain, tmp_path, toy_folder, monkeypatch):
+    flags = ("bake", toy_folder, "--size", "6x5x64", "--out", tmp_path / "a.npy", "--quiet", "--json")
+    report = json.loads(solidgrain(*flags, "--shard", "1/4").out)
+    assert report["voxels_per_second"] == pytest.approx(6 * 5 * 16 / report["seconds"], rel=0.1)
+    report = json.loads(solidgrain(*flags, "--resume").out)
+    assert report["reused_slices"] == 16
+    assert report["voxels_per_second"] == pytest.approx(6 * 5 * 48 / report["seconds"], rel=0.1)
+    monkeypatch.setattr(report_module, "measure_rate", lambda *_: 1000.0)
+    for shard, slices in (("--seed=1", 64), ("--shard=1/4", 16)):
+        assert json.loads(solidgrain(*flags, "--overwrite", "--dry-run", shard).out)["seconds"] == 0.03 * slices
+
+
+def test_a_finished_output_is_merged_where_it_was_moved_to(solidgrain, tmp_path, toy_folder, monkeypatch):
+    (tmp_path / "before").mkdir()
+    monkeypatch.chdir(tmp_path / "before")
+    assert solidgrain("bake", toy_folder, "--size", 4, "--out", "a.npy", "--out", "b.npy", "--quiet").code == 0
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "before").rename(tmp_path / "after")
+    outcome = solidgrain("merge", tmp_path / "after" / "a.npy")
+    assert (outcome.code, outcome.error) == (0, "toy: nothing to merge, its files are whole")
+
+
+def test_a_bake_that_cannot_begin_leaves_nothing_behind(toy, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(staging_module, "replacing", full)
+    with pytest.raises(BakeError, match="No space left on device"):
+        bake(plan_for(toy, make_output(tmp_path / "a.npy")), toy)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_dry_run_removes_nothing(solidgrain, tmp_path, toy_folder):

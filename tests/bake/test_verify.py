@@ -76,6 +76,18 @@ def test_files_that_are_whole_but_of_something_else_are_found(solidgrain, files,
     assert solidgrain("verify", "a.npy", "--voxels", 0).code == 0
 
 
+def test_what_is_wrong_with_one_is_said_whatever_the_others_are(solidgrain, files):
+    (files / "a.vti").write_bytes(b"damaged")
+    outcome = solidgrain("verify", "none.vti", "a.vti", "no.npy", "a.npy")
+    assert outcome.code == 3
+    assert outcome.out.splitlines()[0].startswith("a.vti: 7 bytes, expected")
+    assert outcome.out.splitlines()[1].startswith("a.npy: 1 files whole")
+    assert [line.split(":")[1] for line in outcome.err.splitlines()] == [" none.vti.bake.json", " no.npy.bake.json"]
+    outcome = solidgrain("verify", "none.vti", "a.npy")
+    assert (outcome.code, outcome.out.splitlines()[0][:16]) == (1, "a.npy: 1 files w")
+    assert "none.vti.bake.json: cannot read the manifest" in outcome.error
+
+
 @pytest.mark.parametrize("with_hash", [True, False])
 def test_an_edited_manifest_is_refused(solidgrain, files, with_hash):
     manifest = json.loads((files / "a.npy.bake.json").read_text())

@@ -290,6 +290,7 @@ def test_a_mask_that_is_changed_afterwards_changes_nothing(space, ends, volume):
         (np.zeros((2, 2, 2, 3)), "expected a volume"),
         (np.zeros((0, 2, 2)), "at least one voxel"),
         (np.full((1, 1, 2), np.nan), "values from nan"),
+        (np.array([0.0, 0.5, np.nan]).reshape(3, 1, 1), "values from nan"),  # not in the first plane
         (np.full((1, 1, 2), 1.5), "to 1.5, expected 0 to 1"),
         (np.full((1, 1, 2), -0.5), "from -0.5"),
         (np.zeros((1, 1, 2), np.int64), "mask of int64"),
@@ -302,7 +303,9 @@ def test_what_is_no_mask_is_refused(space, ends, values, message):
         space.blend_by(*ends, values)
 
 
-@pytest.mark.parametrize("place", [{"origin": (0, 0)}, {"origin": (0, 0, np.inf)}, {"spacing": 0}, {"spacing": (1, -1, 1)}])
+@pytest.mark.parametrize(
+    "place", [{"origin": (0, 0)}, {"origin": (0, 0, np.inf)}, {"spacing": 0}, {"spacing": (1, -1, 1)}, {"spacing": 1e-310}]
+)
 def test_a_mask_without_a_place_is_refused(space, ends, volume, place):
     with pytest.raises(EvaluationError, match="mask at"):
         space.blend_by(*ends, volume, **place)

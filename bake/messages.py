@@ -1,0 +1,22 @@
+"""What commands say besides their data: lines on stderr."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+
+def tell(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+def tell_error(message: object) -> None:
+    tell(f"solidgrain: {message}")
+
+
+def tell_next(file: Path, sampler_sha256: str, bundle: str) -> None:
+    """How to bake a texture file; `bundle` names its space, which need not be said where it is found anyway."""
+    from solidgrain.runtime.bundle import find_bundle
+
+    flag = "" if find_bundle(sampler_sha256, file.parent) else f" --bundle {bundle}"
+    tell(f"{file}: next: solidgrain bake {file}{flag} --size 128 --out out.vti")
