@@ -1,8 +1,8 @@
 """Many bakes from one file: `--jobs jobs.json` (or .toml).
 
-A job's keys are the flags of `solidgrain bake` with `_` for `-`, and `name` and `texture`; `defaults` hold for all jobs that have a
-use for them. An output is a file name, or an object with `path` and settings of its format. Relative paths are relative to the job file's
-folder. All jobs are checked before the first is baked.
+A job's keys are the flags of `solidgrain bake` with `_` for `-`, and `name` and `texture`; `defaults` hold for all jobs that
+have a use for them. An output is a file name, or an object with `path` and settings of its format. Relative paths are relative
+to the job file's folder. All jobs are checked before the first is baked.
 """
 
 from __future__ import annotations
