@@ -35,7 +35,7 @@ PATHS = ("amx", "avx512bf16", "avx512", "avx2", "portable")
 BFLOAT16_PATHS = ("amx", "avx512bf16")
 BRICK = 4096  # voxels
 WORK_PER_TASK = 4 * BRICK * 128**2  # points times squared width: some milliseconds, a fifth of a second on the slowest path
-STEEPEST = 2.0**13  # texels per pixel: times the farthest point, below 2^53
+STEEPEST = 2.0**13  # texels per pixel: times the farthest point below 2^53, so that cells are exact (within one: below 2^40)
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
@@ -144,31 +144,32 @@ class KernelInstance:
 
     def _points(self, points: DoubleArray, rgb: FloatArray) -> None:
         found = self.library.solidgrain_points(self.handle, points.ctypes.data, len(points), rgb.ctypes.data)
-        if found != -1:
-            self._fail(found, points[found] if found >= 0 else points[0])
+        if self._is_wrong(found):
+            raise EvaluationError.of_nan(self.name, points[found])
 
     def _bricks(self, x: DoubleArray, y: DoubleArray, z: DoubleArray, first: int, count: int, rgb: FloatArray) -> None:
         axes = [item for axis in (x, y, z) for item in (axis.ctypes.data, len(axis))]
         found = self.library.solidgrain_grid(self.handle, *axes, first, count, rgb.ctypes.data)
-        if found != -1:
+        if self._is_wrong(found):
             rows, column = divmod(found, len(x))
             plane, row = divmod(rows, len(y))
-            self._fail(found, (x[column], y[row], z[plane % len(z)]))
+            raise EvaluationError.of_nan(self.name, (x[column], y[row], z[plane]))
 
-    def _fail(self, found: int, place: Sequence[float]) -> None:
-        if found < 0:
+    def _is_wrong(self, found: int) -> bool:
+        """Whether what a call returned is the index of a colour that is not finite. Raises EvaluationError without memory."""
+        if found == -2:
             raise EvaluationError(f"{self.name}: not enough memory for the fused kernel")
-        raise EvaluationError.of_nan(self.name, place)
+        return found >= 0
 
 
 def _library_file() -> Path:
     """The kernel's library. Raises KernelMissingError if it was not built."""
     named = os.environ.get("SOLIDGRAIN_KERNEL_LIBRARY")
     if named:
-        return Path(named)
+        return Path(named).absolute()  # a bare name would be looked for in the system's folders
     found = sorted(Path(__file__).parent.glob("_kernel*"))
     if not found:
-        raise KernelMissingError("the fused kernel was not built; install solidgrain where a C++ compiler is")
+        raise KernelMissingError("the fused kernel was not built; install solidgrain where a C++17 compiler is")
     return found[0]
 
 
@@ -229,6 +230,7 @@ def _check_whole(path: Path) -> None:
         return  # another kind of library: its loader will tell
     if len(header) < 64:
         raise ValueError(f"{path} is cut short")
-    (start,), (size, count) = struct.unpack_from("<Q", header, 40), struct.unpack_from("<HH", header, 58)
+    order = ">" if header[5] == 2 else "<"
+    (start,), (size, count) = struct.unpack_from(f"{order}Q", header, 40), struct.unpack_from(f"{order}HH", header, 58)
     if path.stat().st_size < start + size * count:
         raise ValueError(f"{path} is cut short")

@@ -62,7 +62,7 @@ def untiled(transforms: DoubleArray) -> Tiling:
 def tiled(transforms: DoubleArray, period: tuple[float, float, float], axes: str) -> Tiling:
     """Tile the named axes (any subset of "xyz") with a period (x, y, z) in exemplar pixels.
 
-    Raises EvaluationError for an unknown axis or a period that is not positive.
+    Raises EvaluationError for an unknown axis, or a period that is not positive or too large.
     """
     if not axes:
         return untiled(transforms)
@@ -74,6 +74,8 @@ def tiled(transforms: DoubleArray, period: tuple[float, float, float], axes: str
         raise EvaluationError(f"tile period {period}: expected more than 0 along {axes}")
     moved, lattice = transforms.copy(), np.empty_like(transforms)
     spans = np.array([period[k] for k in chosen])
+    if np.abs(transforms[:, :, chosen] * spans).max() >= EXACT:
+        raise EvaluationError(f"tile period {period}: too large for an exact seam; use a shorter one")
     for octave, transform in enumerate(transforms):
         whole = _nearest_of_full_rank(transform[:, chosen] * spans)
         moved[octave][:, chosen] = whole / spans

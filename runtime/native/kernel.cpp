@@ -46,18 +46,25 @@ bool runs(const Path& path) {
                              __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
   static const bool avx512bf16 = avx512 && has_avx512bf16();
   static const bool amx = avx512bf16 && has_amx();  // it converts by AVX-512 BF16
-  return &path == &amx_path          ? amx
-         : &path == &avx512bf16_path ? avx512bf16
-         : &path == &avx512_path     ? avx512
-         : &path == &avx2_path       ? avx2
-                                     : true;
+  const auto is = [&](const char* name) { return !strcmp(path.name, name); };
+  return is("amx") ? amx : is("avx512bf16") ? avx512bf16 : is("avx512") ? avx512 : is("avx2") ? avx2 : true;
 }
-
-const Path* const paths[] = {&amx_path, &avx512bf16_path, &avx512_path, &avx2_path, &portable_path};
 #else
 bool runs(const Path&) { return true; }
-const Path* const paths[] = {&portable_path};
 #endif
+
+const Path* const paths[] = {
+#if SOLIDGRAIN_AMX
+    &amx_path,
+#endif
+#if SOLIDGRAIN_AVX512BF16
+    &avx512bf16_path,
+#endif
+#if defined(__x86_64__)
+    &avx512_path,     &avx2_path,
+#endif
+    &portable_path,
+};
 
 const Path* find_path(const char* name) {
   for (const Path* path : paths)
@@ -150,6 +157,7 @@ struct Bricks {
     while (height * height * 4 <= across) height *= 2;
     size[1] = rows < height ? rows : height;
     size[0] = across / size[1];
+    if (size[0] > 16) size[0] -= size[0] % 16;
     count[0] = (columns + size[0] - 1) / size[0];
     count[1] = (rows + size[1] - 1) / size[1];
     count[2] = (planes + size[2] - 1) / size[2];

@@ -88,8 +88,8 @@ template <class S> inline typename S::I modulo_texels(typename S::D v) {
   return S::to_int(S::fma(S::floor(S::mul(v, S::all(1.0 / TEXELS))), S::all(-double(TEXELS)), v));
 }
 
-// From a canonical cell to its corners: one step leaves the canonical range by less than a period along each axis, so there
-// is nothing to divide. A corner's texel is its mixed-radix number modulo 64^3 (`solidgrain.runtime.lattice`).
+// From a canonical cell to its corners: one step leaves the canonical range by less than a period along x and y, by less than
+// two along z, so there is nothing to divide. A corner's texel is its mixed-radix number modulo 64^3 (`solidgrain.runtime.lattice`).
 // Number is I where the lattice allows (`is_small`), D otherwise.
 template <class S, class Scalar, class Number>
 inline void lattice_edge(const double* basis, const Number (&cell)[3], int edge, typename S::I& low, typename S::I& high) {

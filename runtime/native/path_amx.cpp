@@ -1,5 +1,7 @@
 // The path for processors with AMX (bfloat16 tiles): noise in AVX-512, the perceptron in tiles.
-#if defined(__x86_64__)
+#include "sampler.hpp"
+
+#if SOLIDGRAIN_AMX
 #include <cmath>
 #include <cstdint>
 #include <cstring>

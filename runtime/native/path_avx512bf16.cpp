@@ -1,6 +1,8 @@
 // The path for processors with AVX-512 BF16, which multiply pairs of bfloat16 (Zen 4, Cooper Lake, and what has AMX without being
 // allowed to use it); in float32 it is the AVX-512 path.
-#if defined(__x86_64__)
+#include "sampler.hpp"
+
+#if SOLIDGRAIN_AVX512BF16
 #include <cmath>
 #include <cstdint>
 #include <cstring>

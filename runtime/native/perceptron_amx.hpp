@@ -4,7 +4,8 @@
 // "pair"), a sum tile 16 outputs x 16 points. Two by two tiles of sums are accumulated at a time.
 //
 // In float32 precision every number is split into two bfloat16, high and low parts, and three products are summed,
-// high x high + high x low + low x high: what is left out is 2^-16 of each product and less.
+// high x high + high x low + low x high. Activations are cut off, not rounded, so that what is left out is up to 2^-14 of a
+// product, and 2^-17 typically.
 #pragma once
 
 #include <immintrin.h>
@@ -16,8 +17,11 @@
 
 namespace {
 
-constexpr int AMX_BLOCK = 64;                // points; activations of two layers and the weights of a tile row fit the first-level cache
+constexpr int AMX_BLOCK = 64;                // points; in bfloat16, two layers' activations and a row of weights fit the first-level cache
 constexpr int STRIPS = AMX_BLOCK / 16;       // of 16 points
+static_assert(PADDING % AMX_BLOCK == 0, "whole blocks of eta");
+// A layer begins with its first two strips while the last two of the layer before are still on their way (`Pending`).
+static_assert(STRIPS >= 4 && STRIPS % 2 == 0, "two strips at a time, of at least four");
 constexpr int TILE = 16 * 32;                // bfloat16 numbers in a tile, 1 KiB
 constexpr int ROW_BYTES = 64;
 

@@ -12,13 +12,14 @@ constexpr int64_t TEXELS = int64_t(RESOLUTION) * RESOLUTION * RESOLUTION;
 constexpr float SLOPE = 0.2f;                // of the leaky ReLU (gramgan/models.py)
 constexpr int SWEEP = 4096;                  // points per sweep over the octaves: one table at a time is in the cache
 constexpr int PADDING = 192;                 // points are filled up to a multiple of every path's block
-constexpr int STRIDE = 4224;                 // floats from one octave's eta to the next: a whole sweep, filled up
+constexpr int STRIDE = (SWEEP + PADDING - 1) / PADDING * PADDING;  // floats from one octave's eta to the next
 constexpr size_t ALIGNMENT = 64;
 
 // The upper half of a float, to the nearest, ties to even.
 static inline uint32_t round_to_bfloat16(float value) {
   uint32_t bits;
   memcpy(&bits, &value, 4);
+  if (value != value) return 0x7fc0;  // the sum below would carry some NaNs over into zero
   return (bits + 0x7fff + (bits >> 16 & 1)) >> 16;
 }
 
@@ -63,7 +64,12 @@ struct Path {
   void (*perceive)(const Sampler&, const float* eta, int count, float* rgb, void* scratch);
 };
 
-extern const Path portable_path;
-#if defined(__x86_64__)
-extern const Path avx2_path, avx512_path, avx512bf16_path, amx_path;
+// What the compiler knows: GCC has AVX-512 BF16 since 10, AMX since 11.
+#if defined(__x86_64__) && (defined(__clang__) || __GNUC__ >= 10)
+#define SOLIDGRAIN_AVX512BF16 1
 #endif
+#if defined(__x86_64__) && (defined(__clang__) || __GNUC__ >= 11)
+#define SOLIDGRAIN_AMX 1
+#endif
+
+extern const Path portable_path, avx2_path, avx512_path, avx512bf16_path, amx_path;

@@ -435,3 +435,10 @@ except KeyboardInterrupt:
         process.send_signal(2)
         assert float(process.stdout.readline()) - sent < 0.5
         assert process.wait(10) == 0
+
+
+def test_a_library_may_be_named_from_the_working_folder(tmp_path, monkeypatch):
+    shutil.copy(kernel._library_file(), tmp_path / "mine.so")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SOLIDGRAIN_KERNEL_LIBRARY", "mine.so")
+    assert kernel.kernel_paths()[-1] == "portable"

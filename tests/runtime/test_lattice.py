@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -89,3 +90,9 @@ def test_without_tiling_every_octave_repeats_as_its_table_does():
 def test_axes_and_periods_that_make_no_sense_are_refused(period, axes):
     with pytest.raises(EvaluationError, match="tile"):
         tiled(transforms(), period, axes)
+
+
+def test_a_period_without_an_exact_seam_is_refused_without_warnings():
+    with warnings.catch_warnings(), pytest.raises(EvaluationError, match="too large for an exact seam"):
+        warnings.simplefilter("error")
+        tiled(np.eye(3)[None], (2.0**70, 1.0, 1.0), "x")
