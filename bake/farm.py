@@ -17,10 +17,14 @@ def anywhere(plan: Plan) -> Plan:
 
 
 def seen_from(folder: Path, plan: Plan) -> Plan:
-    """`anywhere`, but outputs in `folder` go by their names alone: it may be moved, or be seen elsewhere."""
+    """`anywhere`, but what lies in `folder` goes by its name alone: it may be moved, or be seen elsewhere.
+
+    That is for a plan in a file of this folder; `load_plan` undoes it.
+    """
     plan, folder = anywhere(plan), folder.absolute()
     outputs = (replace(one, path=Path(one.path.name)) if one.path.parent == folder else one for one in plan.outputs)
-    return replace(plan, outputs=tuple(outputs))
+    source = Path(plan.source)
+    return replace(plan, outputs=tuple(outputs), source=source.name if source.parent == folder else plan.source)
 
 
 def shard_count(plan: Plan, asked: int | None) -> int:

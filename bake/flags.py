@@ -150,7 +150,7 @@ def make_plan(arguments: argparse.Namespace, texture: Texture) -> Plan:
 
 
 def make_outputs(arguments: argparse.Namespace) -> list[Output]:
-    """The files that the flags name, with the settings of their formats."""
+    """The files that the flags name, by absolute paths, with the settings of their formats."""
     from solidgrain.bake.writers import PREVIEW, formats, kind_of, make_output
 
     _check_uses(arguments)
@@ -160,11 +160,11 @@ def make_outputs(arguments: argparse.Namespace) -> list[Output]:
         row = formats()[kind]
         flags = {option.name: getattr(arguments, f"{row.name}_{option.name}".replace("-", "_")) for option in row.options}
         given = {name: value for name, value in flags.items() if value is not None}
-        outputs.append(make_output(path, kind, **_shared_options(arguments, kind), **given))
+        outputs.append(make_output(path.absolute(), kind, **_shared_options(arguments, kind), **given))
     if arguments.preview:
         if arguments.preview.suffix.lower() != ".png":
             raise UsageError(f"--preview {arguments.preview}: expected a name that ends in .png")
-        outputs.append(make_output(arguments.preview, PREVIEW))
+        outputs.append(make_output(arguments.preview.absolute(), PREVIEW))
     return outputs
 
 

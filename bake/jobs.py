@@ -118,7 +118,7 @@ def _read_job(parser: JobParser, values: dict[str, Any], where: str, folder: Pat
     arguments.source = _source(values.get("texture"), folder)
     arguments.bundle = _source(values.get("bundle"), folder)
     outputs = _outputs(values)
-    settings = {folder / out.pop("path"): out for out in outputs}
+    settings = {(folder / out.pop("path")).absolute(): out for out in outputs}
     if len(settings) < len(outputs):
         raise UsageError("out: two outputs have the same name")
     arguments.out = list(settings)

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from solidgrain.bake.farm import seen_from
 from solidgrain.bake.plan import Plan, hash_of
 from solidgrain.bake.store import sha256_of
 from solidgrain.bake.writers import Output
@@ -25,7 +26,7 @@ def manifest_path(output: Path) -> Path:
 def stage_manifest(plan: Plan, output: Output, files: list[dict[str, Any]], staging: Path) -> None:
     """Write, in the staging folder, that an output is complete. `files` have a name ("final"), "bytes" and "sha256"."""
     values = {
-        "plan": plan.to_json(),
+        "plan": seen_from(output.path.parent, plan).to_json(),
         "output": output.path.name,
         "work": hash_of(plan.work(output)),
         "files": {file["final"]: {"bytes": file["bytes"], "sha256": file["sha256"]} for file in files},
@@ -67,7 +68,8 @@ def read_manifest(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_bytes())
     except OSError as error:
-        raise BakeError(f"{path}: cannot read the manifest ({error.strerror})") from error
+        advice = "; name what was baked as it was given to --out, such as a.vti or a.####.exr"
+        raise BakeError(f"{path}: cannot read the manifest ({error.strerror}){advice}") from error
     except (ValueError, RecursionError) as error:
         raise BakeError(f"{path}: not JSON ({error}); bake again with --overwrite") from error
     if not isinstance(values, dict) or not {"plan", "output", "work", "files"} <= set(values) or not _lists_files(values):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 
@@ -18,5 +19,5 @@ def tell_next(file: Path, sampler_sha256: str, bundle: str) -> None:
     """How to bake a texture file; `bundle` names its space, which need not be said where it is found anyway."""
     from solidgrain.runtime.bundle import find_bundle
 
-    flag = "" if find_bundle(sampler_sha256, file.parent) else f" --bundle {bundle}"
-    tell(f"{file}: next: solidgrain bake {file}{flag} --size 128 --out out.vti")
+    words = [str(file), *([] if find_bundle(sampler_sha256, file.parent) else ["--bundle", bundle])]
+    tell(f"{file}: next: solidgrain bake {shlex.join(words)} --size 128 --out out.vti")

@@ -20,7 +20,7 @@ DITHERING = 9  # the same where noise is made, from hashes of 64 bits: 8
 AVERAGING = 3.25  # the same, times the samples per voxel: themselves, their linear light, a term of it, and where that holds
 BASE_MEMORY = 220 * 2**20  # interpreter, libraries, noise tables, the chunks in flight
 FORMAT_VERSION = 1  # of plans and manifests
-BYTES_VERSION = 1  # of what writers make of a plan: one more with every change of it
+BYTES_VERSION = 2  # of what writers make of a plan: one more with every change of it
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -56,6 +56,7 @@ class Plan:
             sampler_sha256=self.sampler_sha256,
             seed=self.seed,
             tile=self.tile,
+            transform=self.transform,
         )
 
     @property
@@ -110,8 +111,12 @@ def plan_from_json(values: dict[str, Any]) -> Plan:
 
 def located(source: str) -> str:
     """Where a texture or bundle is, from any working folder; an embedded name as it is."""
-    path = Path(source)
-    return str(path.absolute()) if path.is_file() or (path / MANIFEST).is_file() else source
+    return str(Path(source).absolute()) if is_there(Path(source)) else source
+
+
+def is_there(source: Path) -> bool:
+    """Whether there is a texture file or a bundle, not yet whether it can be read."""
+    return source.is_file() or (source / MANIFEST).is_file()
 
 
 def hash_of(values: dict[str, Any]) -> str:

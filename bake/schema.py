@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from solidgrain.bake.plan import FORMAT_VERSION, Plan, plan_from_json
+from solidgrain.bake.plan import FORMAT_VERSION, Plan, is_there, plan_from_json
 from solidgrain.bake.writers import PREVIEW, Output, formats, make_output
 from solidgrain.runtime.errors import UsageError
 
@@ -24,12 +24,20 @@ LONGEST = 60  # characters of a value that an error shows
 def load_plan(path: Path) -> Plan:
     """The plan of a file: a plan by itself, or what a manifest, a dry run or a report of `solidgrain bake` has as "plan".
 
-    Raises UsageError for what is no plan, is one of another version, or was edited without dropping its hash.
+    Its relative paths are relative to the file's folder. Raises UsageError for what is no plan, is one of another version, or
+    was edited without dropping its hash.
     """
     values = read_data(path)
     if isinstance(values, dict) and "plan" in values:
-        return plan_of(values["plan"], str(path), "plan")
-    return plan_of(values, str(path))
+        return seen_in(path.parent, plan_of(values["plan"], str(path), "plan"))
+    return seen_in(path.parent, plan_of(values, str(path)))
+
+
+def seen_in(folder: Path, plan: Plan) -> Plan:
+    """A plan from a file in this folder, by absolute paths: of its outputs, and of a texture or bundle that lies there."""
+    outputs = (replace(output, path=(folder / output.path).absolute()) for output in plan.outputs)
+    source = (folder / plan.source).absolute()
+    return replace(plan, outputs=tuple(outputs), source=str(source) if is_there(source) else plan.source)
 
 
 def plan_of(values: Any, where: str, place: str = "") -> Plan:

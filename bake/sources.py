@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+from zipfile import is_zipfile
 
 import numpy as np
 import numpy.typing as npt
@@ -39,8 +40,10 @@ def _silent(line: str) -> None:
 
 
 def is_photograph(source: str) -> bool:
-    """Whether a source is an image file, by its name; whether it can be read is another question."""
-    return Path(source).suffix.lower() in SUFFIXES
+    """Whether a source is an image file: by its name, or a file that is no archive, as textures are. Whether it can be read is
+    another question."""
+    path = Path(source)
+    return path.suffix.lower() in SUFFIXES or (path.is_file() and path.suffix != ".npz" and not is_zipfile(path))
 
 
 def open_in_space(space: Space, source: str, cut: Cut = WHERE_IT_IS, on_note: Note = _silent) -> Texture:

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from solidgrain.bake.color import from_srgb, to_linear, to_srgb
 from solidgrain.bake.manifest import SUFFIX, damaged_files, manifest_path, read_manifest
 from solidgrain.bake.plan import Plan, hash_of
-from solidgrain.bake.schema import plan_of
+from solidgrain.bake.schema import plan_of, seen_in
 from solidgrain.bake.writers import FloatArray, Output, clips, open_writer
 from solidgrain.runtime import Texture, load_texture
-from solidgrain.runtime.errors import BakeError
+from solidgrain.runtime.errors import BakeError, BundleError
 
 MACHINES = 1e-3  # by how much two machines' paths of the sampler may differ, in any colour space
 
@@ -45,13 +45,7 @@ def verify(
     compared, largest = 0, 0.0
     if voxels and not wrong:
         plan, output = _planned(manifest, path)
-        texture = load_texture(
-            source or plan.source,
-            bundle=bundle or plan.bundle,
-            provider=provider,
-            precision=plan.precision,
-            threads=threads,
-        )
+        texture = _texture(plan, path, source, bundle, provider, threads)
         check_texture(plan, texture, f"{path}")
         compared, largest = compare(plan, output, texture, voxels)
         if not largest <= MACHINES:
@@ -59,9 +53,21 @@ def verify(
     return Verified(output_path, len(manifest["files"]), wrong, compared, largest)
 
 
+def _texture(plan: Plan, path: Path, source: str | None, bundle: str | None, provider: str, threads: int) -> Texture:
+    """The texture of a manifest's plan. Raises BakeError where the plan says it is, there is none."""
+    source_of, bundle_of = source or plan.source, bundle or plan.bundle
+    try:
+        return load_texture(source_of, bundle=bundle_of, provider=provider, precision=plan.precision, threads=threads)
+    except BundleError as error:
+        if source or bundle:
+            raise
+        where = "say where it is with --source, or check the files alone with --voxels 0"
+        raise BakeError(f"{path}: its files are whole, but not its texture: {error}; {where}") from error
+
+
 def _planned(manifest: dict[str, Any], path: Path) -> tuple[Plan, Output]:
     """The plan of a manifest, and its output where the manifest lies now."""
-    plan = plan_of(manifest["plan"], str(path), "plan")
+    plan = seen_in(path.parent, plan_of(manifest["plan"], str(path), "plan"))
     for output in plan.outputs:
         if output.path.name == manifest["output"] and hash_of(plan.work(output)) == manifest["work"]:
             return plan, replace(output, path=path.parent / output.path.name)

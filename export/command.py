@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -34,6 +35,6 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(open_bundle(folder).manifest, indent=2))
     else:
         size = sum(path.stat().st_size for path in folder.iterdir())
-        source = f"PHOTO --bundle {folder}" if space else folder
+        source = f"PHOTO --bundle {shlex.quote(str(folder))}" if space else shlex.quote(str(folder))
         print(f"{folder}: {size / 1024:.0f} KB; next: solidgrain bake {source} --size 128 --out out.vti", file=sys.stderr)
     return 0

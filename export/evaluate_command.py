@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
 from solidgrain.bake.arguments import parse_count, parse_positive, parse_scale
+from solidgrain.bake.messages import tell
 from solidgrain.runtime.errors import UsageError
 
 SHEETS = (".png", ".html")
@@ -55,8 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
     scale = arguments.patch_scale or exemplar_scale(texture)
     exemplar = read_exemplar(arguments.exemplar, SMALLEST, scale, "use a larger photograph or a smaller --patch-scale")
     reduced = "" if scale == 1 else f", of whose pixels {scale:g}x{scale:g} are one"
-    print(f"measuring {2 * arguments.slices} slices of {texture.name} against {arguments.exemplar}{reduced}", file=sys.stderr)
-    found = measure(texture, exemplar, arguments.slices, inception)
+    tell(f"measuring {2 * arguments.slices} slices of {texture.name} against {arguments.exemplar}{reduced}")
+    found = measure(texture, exemplar, arguments.slices, inception, tell)
     figures = found.figures
     print(json.dumps(found.as_json(), indent=2) if arguments.json else figures.markdown())
     if arguments.sheet:

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -62,7 +63,12 @@ def open_texture(data: TextureData | BlendData, owner: Bundle, provider: str, pr
         engine, note = open_blend_engine(owner, data, provider.lower(), precision)
     else:
         engine, note = open_engine(owner, data, provider.lower(), precision)
-    return Texture(data, owner, engine, workers, note)
+    return Texture(data, owner, engine, workers, provider, note)
+
+
+def _opened_again(data: TextureData | BlendData, owner: Bundle, provider: str, precision: str, threads: int) -> Texture:
+    """What a copy of a texture begins as, in this process or in another one."""
+    return open_texture(data, owner, provider, precision, make_workers(threads))
 
 
 def make_workers(threads: int) -> Workers:
@@ -119,12 +125,16 @@ class Texture:
     """A solid texture: colour at every point of space, in endless instances, one per seed."""
 
     def __init__(
-        self, data: TextureData | BlendData, bundle: Bundle, engine: Engine, workers: Workers, provider_note: str = ""
+        self, data: TextureData | BlendData, bundle: Bundle, engine: Engine, workers: Workers, provider: str, note: str
     ) -> None:
-        self.data, self.bundle, self.workers, self.provider_note = data, bundle, workers, provider_note
-        self._engine = engine
+        self.data, self.bundle, self.workers, self.provider_note = data, bundle, workers, note
+        self._engine, self._asked = engine, provider
         self._last: tuple[object, Instance] | None = None
         self._last_tiling: tuple[object, Tiling] | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled, it is its data, and its bundle by the folder: whoever unpickles it opens an engine for it anew."""
+        return _opened_again, (self.data, self.bundle, self._asked, self.precision, self.threads)
 
     @property
     def name(self) -> str:

@@ -129,4 +129,6 @@ def _damaged(path: Path) -> Iterator[None]:
     except OSError as error:
         raise BundleError(f"{path}: cannot read the texture file ({error})") from error
     except DAMAGED_ARCHIVE as error:
-        raise BundleError(f"{path}: not a texture file, or damaged ({type(error).__name__}); save it again") from error
+        raise BundleError(
+            f"{path}: not a texture file, or a damaged one; save it again, or solidgrain encode a photograph"
+        ) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -113,7 +114,8 @@ def tell_of_interruption(folder: Path) -> None:
 
     if not (folder / OPTIONS).exists():
         raise KeyboardInterrupt  # nothing to speak of was begun
-    print(f"interrupted; go on from its last checkpoint with: solidgrain train --resume {folder}", file=sys.stderr)
+    resume = f"solidgrain train --resume {shlex.quote(str(folder))}"
+    print(f"interrupted; go on from its last checkpoint with: {resume}", file=sys.stderr)
 
 
 def train_together(arguments: argparse.Namespace, device: torch.device, processes: Processes) -> int:
@@ -144,14 +146,15 @@ def how_to_go_on(training: RunFolder, stopped: bool, ending: Ending, flags: str)
     from solidgrain.train.run import CHECKPOINT
 
     folder = training.folder
+    named = shlex.quote(str(folder))
     done = f"done after {ending.iteration} iterations" if training.budget.until_plateau else "done"
     if stopped:
-        return f"stopped{' and saved' * ending.saved}; go on with: solidgrain train --resume {folder}{flags}"
+        return f"stopped{' and saved' * ending.saved}; go on with: solidgrain train --resume {named}{flags}"
     if not (folder / CHECKPOINT).exists():
         return f"{folder}: {done}, and nothing is worth keeping; train again with another --seed"
     if training.settings.noise_at_input:
         return f"{folder}: {done}; its slices are in {folder / 'samples'}; a bundle cannot hold noise at the input"
-    return f"{folder}: {done}; next: solidgrain export {folder} --out BUNDLE"
+    return f"{folder}: {done}; next: solidgrain export {named} --out BUNDLE"
 
 
 def budget_flags(arguments: argparse.Namespace) -> str:

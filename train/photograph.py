@@ -26,7 +26,7 @@ class Photograph(NamedTuple):
 
     pixels: FloatArray  # sRGB-encoded, [H, W, 3] in [0, 1]
     colorspace: str  # what the file's colours were read as
-    warning: str  # what the file declares of its colours that could not be honoured, or ""
+    warning: str  # what the file declares that could not be honoured, or ""
 
 
 def read_exemplar(path: str | os.PathLike[str], smallest: int, scale: float = 1.0, advice: str = ADVICE) -> FloatArray:
@@ -71,11 +71,13 @@ def read_photograph(path: str | os.PathLike[str], smallest: int, advice: str = A
     if pixels is None or error:
         raise ExemplarError(f"{path}: the image data is damaged or cut short ({_first_line(error)}); export it again")
     rgb = np.asarray(pixels, np.float32)[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
+    hidden = spec.alpha_channel >= 0 and bool((pixels[..., spec.alpha_channel] < 1).any())
     if not np.isfinite(rgb).all():
         raise ExemplarError(f"{path}: holds NaN or infinite pixels; expected finite colours")
     encoded = encode(upright(rgb, spec.get_int_attribute("Orientation", 1)), spec)
     pixels = np.ascontiguousarray(encoded.rgb.clip(0.0, 1.0), np.float32)
-    return Photograph(pixels, encoded.colorspace, encoded.warning)
+    warnings = [encoded.warning, "is transparent in places, whose colours count like the others; crop or fill them" * hidden]
+    return Photograph(pixels, encoded.colorspace, "; ".join(filter(None, warnings)))
 
 
 def upright(pixels: FloatArray, orientation: int) -> FloatArray:

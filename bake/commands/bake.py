@@ -32,7 +32,10 @@ def run(arguments: argparse.Namespace) -> int:
     plan, texture = planned(arguments, encoded)
     if not plan.outputs and not arguments.dry_run:
         raise UsageError("nothing to write: give at least one --out FILE or --preview FILE.png")
-    plan = to_do(plan, arguments)
+    asked, plan = plan, to_do(plan, arguments)
+    skipped = [str(output.path) for output in asked.outputs if output not in plan.outputs]
+    for path in [] if arguments.quiet else skipped:
+        tell(f"{path}: skipped, its files are there")
     if arguments.dry_run:
         encoded.tell_missing()
         report = describe(plan, texture, plan.shard(*arguments.shard) if arguments.shard else None)
@@ -48,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         encoded.remove_unused([plan])
         raise
     if arguments.json:
-        print(json.dumps(report, indent=2))
+        print(json.dumps({**report, "skipped": skipped}, indent=2))
     return 0
 
 

@@ -72,4 +72,8 @@ def _blend(data: BlendData) -> str:
 def _exemplars(entries: list[dict[str, Any]]) -> str:
     if len(entries) > MANY:
         return f"{len(entries)} photographs (licences and credits are in {CARD} and, one by one, in --json)"
-    return ", ".join(f"{entry['exemplar']} ({entry['license']}; {entry['credit']})" for entry in entries)
+    stated = (
+        (entry["exemplar"], entry["license"] or "licence not stated", entry["credit"] or "credit not stated")
+        for entry in entries
+    )
+    return ", ".join(f"{exemplar} ({license}; {credit})" for exemplar, license, credit in stated)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,27 +41,16 @@ def run(arguments: argparse.Namespace) -> int:
 def find_plan(target: Path) -> Plan:
     """The plan of a file; of an output, the one that its shards were baked for. Raises UsageError."""
     from solidgrain.bake.manifest import manifest_path
-    from solidgrain.bake.schema import load_plan
+    from solidgrain.bake.schema import load_plan, plan_of, read_data, seen_in
     from solidgrain.bake.staging import PLAN, staging_folder
 
     if target.suffix.lower() == ".json":
         return load_plan(target)
     if (kept := staging_folder(target) / PLAN).exists():
-        plan = load_plan(kept)
-        return replace(plan, outputs=tuple(replace(output, path=target.parent / output.path) for output in plan.outputs))
+        return seen_in(target.parent, plan_of(read_data(kept), str(kept)))
     if manifest_path(target).exists():
-        return _moved(load_plan(manifest_path(target)), target)
+        return load_plan(manifest_path(target))
     raise UsageError(f"{target}: no shard of it has been baked here; expected an output with shards, or a plan file")
-
-
-def _moved(plan: Plan, target: Path) -> Plan:
-    """A finished plan with its outputs where they are now: those that lay beside the target, beside it still."""
-    before = next((output.path.parent for output in plan.outputs if output.path.name == target.name), None)
-    outputs = (
-        replace(output, path=target.parent / output.path.name) if output.path.parent == before else output
-        for output in plan.outputs
-    )
-    return replace(plan, outputs=tuple(outputs))
 
 
 def to_merge(plan: Plan, overwrite: bool) -> Plan:

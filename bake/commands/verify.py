@@ -40,8 +40,11 @@ def run(arguments: argparse.Namespace) -> int:
             found.append(verify(target, arguments.voxels, **where))
         except SolidgrainError as error:  # what is wrong with the others is to be said, too
             failures.append(error)
-    if found:
-        show(found, arguments.json)
+    if arguments.json:
+        outputs = [{**asdict(one), "output": str(one.output), "sound": not one.wrong} for one in found]
+        print(json.dumps({"outputs": outputs, "errors": [str(error) for error in failures]}, indent=2))
+    else:
+        show(found)
     unsound = any(one.wrong for one in found)
     for failure in failures if unsound else failures[1:]:
         tell_error(failure)
@@ -50,12 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
     return FAILED_VERIFICATION if unsound else 0
 
 
-def show(found: Sequence[Verified], as_json: bool) -> None:
-    """What was found, on stdout."""
-    if as_json:
-        outputs = [{**asdict(one), "output": str(one.output), "sound": not one.wrong} for one in found]
-        print(json.dumps({"outputs": outputs}, indent=2))
-        return
+def show(found: Sequence[Verified]) -> None:
+    """What was found, for people."""
     for one in found:
         compared = f"{one.voxels} voxels evaluated again" if one.voxels else "checksums only"
         print("\n".join(one.wrong) if one.wrong else f"{one.output}: {one.files} files whole, {compared}")

@@ -6,6 +6,7 @@ calls: `encode` depends on its slab alone, and `assemble` reads what the store h
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from abc import ABC, abstractmethod
@@ -37,6 +38,7 @@ class Volume:
     tile: str
     axes: str = "+x+y+z"  # which axes of the texture (x, y, z) of this grid are, with their signs
     level: int = 0  # in the mip chain
+    transform: tuple[tuple[float, ...], ...] | None = None  # 4x4, from the texture's grid to where it was evaluated
 
     @property
     def voxels(self) -> int:
@@ -47,6 +49,12 @@ class Volume:
         """Where voxel (0, 0, 0) is sampled (x, y, z): at its centre."""
         x, y, z = (start + 0.5 * step for start, step in zip(self.origin, self.spacing, strict=True))
         return (x, y, z)
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What a file says of where its colours come from: with these, `Texture.sample` gives them again."""
+        notes = {"texture": self.texture, "seed": str(self.seed), "axes": self.axes}
+        return notes | ({"transform": json.dumps(self.transform)} if self.transform else {})
 
 
 @dataclass(frozen=True)

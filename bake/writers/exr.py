@@ -116,6 +116,8 @@ def slice_header(output: Output, volume: Volume, z: int) -> dict[str, Any]:
         "solidgrain:json": json.dumps({"origin": volume.origin, "spacing": volume.spacing}),  # unrounded
         "solidgrain:axes": f"column {column}, row {row} downwards from the top, slice {along}",
     }
+    if volume.transform:
+        header["solidgrain:transform"] = volume.notes["transform"]
     if volume.tile:
         wraps = ["periodic" if axis in volume.tile else "black" for axis in "xy"]
         header |= {"wrapmodes": ",".join(wraps), "solidgrain:tile": volume.tile}

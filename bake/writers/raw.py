@@ -62,6 +62,7 @@ def provenance(output: Output, volume: Volume) -> dict[str, Any]:
         "origin": volume.origin,
         "spacing": volume.spacing,
         "axes": volume.axes,
+        "transform": volume.transform,
         "tile": volume.tile,
         "level": volume.level,
         "texture": volume.texture,

@@ -2,8 +2,8 @@
 
 Renderers draw nothing without a density, so there always is one; it costs next to nothing, because nodes that the volume
 fills are one value each. The colours' grid is called `Cd`, as Houdini has it; Blender looks for `color`. Half-floats or
-floats, plain or with each leaf of 8x8x8 voxels deflated. Index (x, y, z) is voxel (x, y, z), and its position is the point
-that it was sampled at. Texture, seed, axes and colour encoding are metadata of the grids. The file's layout: vdb_tree.py.
+floats, plain or with each leaf of 8x8x8 voxels deflated. Index (x, y, z) is voxel (x, y, z), and its position is the centre
+of it in the grid. Texture, seed, axes, transform and colour encoding are metadata of the grids. The layout: vdb_tree.py.
 
 The file wants the voxels in cubes of 128 along an edge, column after column, slabs come as slices. So they are spooled, each
 slab cut into columns, and read back cube by cube. Memory: the slab in the type of the file, then up to four cubes of 12.6 MB
@@ -79,8 +79,7 @@ class VdbFile(Writer):
 
     def _head(self, grid: Grid) -> bytes:
         volume = self.volume
-        notes = {"texture": volume.texture, "seed": str(volume.seed), "axes": volume.axes}
-        notes["color_encoding"] = self.output.colorspace
+        notes = {**volume.notes, "color_encoding": self.output.colorspace}
         return vdb_tree.grid_head(grid, self.box, volume.spacing, volume.first_sample, notes)
 
     def _write(self, file: BinaryIO, grid: Grid, leaves: Iterable[Bytes]) -> None:

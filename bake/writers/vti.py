@@ -91,7 +91,7 @@ class VtiFile(SequenceWriter):
         extent = f"0 {width - 1} 0 {height - 1} 0 {depth - 1}"
         origin = " ".join(repr(value) for value in volume.first_sample)
         spacing = " ".join(repr(value) for value in volume.spacing)
-        fields = {"color_encoding": self.output.colorspace, "texture": volume.texture, "seed": str(volume.seed)}
+        fields = {"color_encoding": self.output.colorspace, **volume.notes}
         vtk_type = TYPES[str(self.output.options["type"])][0]
         compressor = ' compressor="vtkZLibDataCompressor"' if self.compressed else ""
         return f"""<?xml version="1.0"?>

@@ -93,6 +93,7 @@ USAGE = (
     "a.01.exr: two outputs",
     "ends in .png",
     "nothing to write",
+    "expected at most",
 )
 
 
@@ -140,6 +141,9 @@ def test_an_existing_output_is_kept_unless_told_otherwise(solidgrain, tmp_path, 
         "bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy", "--out", tmp_path / "b.npy", "--no-clobber"
     )
     assert skipped.code == 0
+    assert skipped.err.splitlines()[0] == f"{tmp_path / 'a.npy'}: skipped, its files are there"
+    again = solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy", "--no-clobber", "--json", "--quiet")
+    assert (json.loads(again.out)["skipped"], again.err) == ([str(tmp_path / "a.npy")], "")
     assert (tmp_path / "a.npy").read_text() == "mine"
     assert (tmp_path / "b.npy").exists()
     assert solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy", "--overwrite").code == 0

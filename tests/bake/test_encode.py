@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import json
 import os
+import shlex
+import shutil
 import subprocess
 import sys
 import weakref
@@ -74,7 +76,7 @@ def test_a_photograph_bakes_as_the_texture_that_is_saved_beside_it(solidgrain, t
     volume = np.load(tmp_path / "cliff.npy")
     np.testing.assert_allclose(volume, texture.grid((8, 8, 8)), atol=1 / 255)
     photograph_is_gone = json.loads((tmp_path / "cliff.npy.bake.json").read_text())["plan"]["source"]
-    assert photograph_is_gone == str(tmp_path / "cliff.sgt.npz")
+    assert photograph_is_gone == "cliff.sgt.npz"
     assert solidgrain("verify", tmp_path / "cliff.npy").code == 0
     assert solidgrain("bake", photograph, *flags, "--resume").code == 0
 
@@ -341,3 +343,15 @@ def test_a_scale_of_no_photograph_is_refused(solidgrain, tmp_path, scale):
     outcome = solidgrain("encode", tmp_path / "p.png", "--out", tmp_path / "p.sgt.npz", "--patch-scale", scale)
     assert outcome.code == 2
     assert "expected pixels of the photograph per texture pixel, from 0.01 to 1000" in outcome.error
+
+
+def test_an_image_is_a_photograph_whatever_it_is_called(solidgrain, toy_space_folder, photograph, tmp_path):
+    shutil.copy(photograph, tmp_path / "my stone")
+    flags = ("--bundle", toy_space_folder, "--size", 4, "--out")
+    assert solidgrain("bake", tmp_path / "my stone", *flags, tmp_path / "a.npy").code == 0
+    assert solidgrain("bake", photograph, *flags, tmp_path / "b.npy").code == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), np.load(tmp_path / "b.npy"))
+    encoded = solidgrain("encode", tmp_path / "my stone", "--bundle", toy_space_folder, "--out", tmp_path / "a b.sgt.npz")
+    command = shlex.split(encoded.err.splitlines()[-1].partition("next: solidgrain ")[2])
+    assert command[:2] == ["bake", str(tmp_path / "a b.sgt.npz")]
+    assert "damaged one; save it again, or solidgrain encode a photograph" in solidgrain("info", tmp_path / "my stone").error

@@ -160,7 +160,7 @@ def test_a_switch_is_true_or_false(write_jobs):
         ({"out": [{"type": "half"}]}, "jobs[0].out: expected a file name"),
         ({"out": ["a.npy", "./a.npy"]}, "out: two outputs have the same name"),
         ({"out": "a.tga"}, "jobs[0] 'a': out a.tga: unknown format '.tga'"),
-        ({"out": {"path": "a.vti", "type": "int4"}}, "jobs[0] 'a': out a.vti: show/a.vti: type 'int4', expected one of uint8"),
+        ({"out": {"path": "a.vti", "type": "int4"}}, "show/a.vti: type 'int4', expected one of uint8"),
         ({"out": {"path": "a.vti", "bits": 4}}, "unknown option 'bits' of vti"),
         ({"out": {"path": "a.vti", "kind": ".npy"}}, "unknown option 'kind' of vti"),
         ({"out": {"path": "a.vti", "where": "here"}}, "unknown option 'where' of vti"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ from solidgrain.bake.flags import add_arguments
 from solidgrain.bake.jobs import JobParser
 from solidgrain.bake.modes import WORK
 from solidgrain.bake.plan import Plan, hash_of, plan_from_json
-from solidgrain.bake.schema import load_plan, plan_of, schema_of
+from solidgrain.bake.schema import load_plan, plan_of, schema_of, seen_in
 from solidgrain.bake.writers import PREVIEW, formats, make_output
+from solidgrain.runtime import load_texture
 from solidgrain.runtime.errors import UsageError
 from tests.bake.test_writers import plan_for
 
@@ -59,8 +61,7 @@ def test_any_plan_comes_back_from_its_json(tmp_path):
         plan = random_plan(draw)
         assert plan_from_json(plan.to_json()) == plan
         path.write_text(json.dumps(plan.to_json()))
-        assert load_plan(path) == plan
-        assert load_plan(path).to_json() == plan.to_json()
+        assert load_plan(path) == seen_in(tmp_path, plan)
 
 
 def test_the_schema_knows_each_key_of_a_plan_and_no_other(toy):
@@ -203,25 +204,42 @@ def test_whole_numbers_in_an_edited_plan_mean_the_same_as_floats(toy, tmp_path):
 
 def test_options_that_a_plan_does_not_mention_have_their_defaults(toy, tmp_path):
     path, _ = saved(toy, tmp_path, outputs=[{"path": "a.vti", "kind": ".vti", "options": {}}])
-    assert load_plan(path).outputs == (make_output(Path("a.vti")),)
+    assert load_plan(path).outputs == (make_output(tmp_path / "a.vti"),)
 
 
 def test_a_manifest_and_a_dry_run_are_plan_files(solidgrain, toy_folder, tmp_path, monkeypatch):
-    """Output paths hold from the working folder, as they were given."""
+    """In any working folder: paths are absolute, those in a manifest's own folder relative to it."""
     first, second = tmp_path / "first", tmp_path / "second"
     first.mkdir()
-    second.mkdir()
     monkeypatch.chdir(first)
     flags = ("--size", "6x5x4", "--seed", 3, "--spacing", 0.3, "--tile", "x", "--out", "a.##.exr", "--out", "a.vti")
     dry = solidgrain("bake", toy_folder, *flags, "--dry-run", "--json").out
     (tmp_path / "dry.json").write_text(dry)
     assert solidgrain("bake", toy_folder, *flags).code == 0
-    monkeypatch.chdir(second)
-    assert solidgrain("bake", "--plan", first / "a.vti.bake.json").code == 0
+    shutil.copytree(first, second)
+    (second / "a.03.exr").unlink()
+    monkeypatch.chdir(tmp_path)
+    assert solidgrain("bake", "--plan", second / "a.vti.bake.json", "--overwrite").code == 0
     for path in first.iterdir():
         assert (second / path.name).read_bytes() == path.read_bytes(), path.name
     again = solidgrain("bake", "--plan", tmp_path / "dry.json", "--overwrite", "--threads", 1, "--provider", "cpu", "--json")
     assert json.loads(again.out)["plan"] == json.loads(dry)["plan"]
+    assert list(tmp_path.glob("*.vti")) == []
+
+
+def test_what_was_baked_of_a_texture_beside_it_moves_with_it(solidgrain, toy_folder, tmp_path):
+    (tmp_path / "before").mkdir()
+    load_texture(toy_folder).save(tmp_path / "before" / "mine.sgt.npz")
+    source = (tmp_path / "before" / "mine.sgt.npz", "--bundle", toy_folder)
+    assert solidgrain("bake", *source, "--size", 4, "--out", tmp_path / "before" / "a.npy").code == 0
+    (tmp_path / "before").rename(tmp_path / "after")
+    assert solidgrain("verify", tmp_path / "after" / "a.npy").code == 0
+    (tmp_path / "after" / "mine.sgt.npz").unlink()
+    outcome = solidgrain("verify", tmp_path / "after" / "a.npy")
+    assert outcome.code == 1
+    assert "its files are whole, but not its texture" in outcome.error
+    assert "say where it is with --source, or check the files alone with --voxels 0" in outcome.error
+    assert solidgrain("verify", tmp_path / "after" / "a.npy", "--voxels", 0).code == 0
 
 
 def test_a_plan_of_another_texture_is_refused(solidgrain, toy, toy_folder, tmp_path):
@@ -290,10 +308,10 @@ def test_a_merge_by_one_output_has_all_of_the_plan(solidgrain, other_texture, to
     assert [output["path"] for output in report["plan"]["outputs"]] == [str(path) for path in outputs]
     assert len(report["files"]) == 2 + (0 if moved else 40)
     for output in outputs:
-        manifest = json.loads(output.with_name(f"{output.name}.bake.json").read_text())
-        assert manifest["plan"] == report["plan"]
-        assert Path(manifest["plan"]["source"]).samefile(other_texture)
-        assert Path(manifest["plan"]["bundle"]).samefile(toy_folder)
+        plan = load_plan(output.with_name(f"{output.name}.bake.json"))
+        assert plan.to_json() == report["plan"]
+        assert Path(plan.source).samefile(other_texture)
+        assert Path(plan.bundle).samefile(toy_folder)
     assert solidgrain("verify", *outputs).code == 0
     assert solidgrain("bake", "--plan", f"{outputs[0]}.bake.json", "--overwrite").code == 0
     assert sorted(path.name for path in folder.iterdir()) == ["a.vti", "a.vti.bake.json", "b.npy", "b.npy.bake.json"]

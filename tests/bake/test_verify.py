@@ -83,6 +83,9 @@ def test_what_is_wrong_with_one_is_said_whatever_the_others_are(solidgrain, file
     assert outcome.out.splitlines()[0].startswith("a.vti: 7 bytes, expected")
     assert outcome.out.splitlines()[1].startswith("a.npy: 1 files whole")
     assert [line.split(":")[1] for line in outcome.err.splitlines()] == [" none.vti.bake.json", " no.npy.bake.json"]
+    report = json.loads(solidgrain("verify", "none.vti", "a.npy", "--json").out)
+    assert [output["output"] for output in report["outputs"]] == ["a.npy"]
+    assert [error.split(":")[0] for error in report["errors"]] == ["none.vti.bake.json"]
     outcome = solidgrain("verify", "none.vti", "a.npy")
     assert (outcome.code, outcome.out.splitlines()[0][:16]) == (1, "a.npy: 1 files w")
     assert "none.vti.bake.json: cannot read the manifest" in outcome.error

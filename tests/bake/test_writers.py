@@ -5,6 +5,7 @@ The volume has three different extents and a random texture, which has no symmet
 
 from __future__ import annotations
 
+import json
 import os
 import tracemalloc
 from pathlib import Path
@@ -304,3 +305,20 @@ def test_a_preview_that_a_full_disk_cut_short_is_noticed(baked, toy, tmp_path, m
     with pytest.raises(BakeError, match="cannot write the preview"):
         bake(plan_for(toy, make_output(tmp_path / "a.png", PREVIEW)), toy)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_files_say_by_which_matrix_and_axes_their_colours_are_found_again(toy, tmp_path):
+    matrix = ((0.0, -1.0, 0.0, 5.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.25), (0.0, 0.0, 0.0, 1.0))
+    names = ("a.vti", "a.raw", "a.####.exr", "a.vdb")
+    outputs = [make_output(tmp_path / name, **({"axes": "+x+z+y"} if name == "a.vti" else {})) for name in names]
+    bake(plan_for(toy, *outputs, transform=matrix), toy)
+    image = pyvista.read(tmp_path / "a.vti")
+    assert image.field_data["axes"] == ["+x+z+y"]
+    found = np.array(json.loads(image.field_data["transform"][0]))
+    ours = image.points[:, [0, 2, 1]]
+    again = toy.sample(ours @ found[:3, :3].T + found[:3, 3], 7)
+    np.testing.assert_allclose(image.point_data["rgb"] / 255, again, atol=0.5 / 255 + 1e-3)
+    assert json.loads((tmp_path / "a.raw.json").read_text())["transform"] == [list(row) for row in matrix]
+    header = OpenEXR.File(os.fspath(tmp_path / "a.0001.exr")).header()
+    assert json.loads(header["solidgrain:transform"]) == [list(row) for row in matrix]
+    assert json.dumps(matrix).encode() in (tmp_path / "a.vdb").read_bytes()

@@ -1,6 +1,8 @@
 """The colour of a voxel depends on texture, seed and coordinate, and on nothing else."""
 
+import copy
 import itertools
+import pickle
 
 import numpy as np
 import pytest
@@ -193,3 +195,11 @@ def test_colours_are_clipped_to_the_unit_range(toy_folder, tmp_path):
 def test_arguments_that_make_no_sense_are_refused_with_their_name(toy, call, message):
     with pytest.raises(EvaluationError, match=message):
         call(toy)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda texture: pickle.loads(pickle.dumps(texture))])
+def test_a_copy_in_this_process_or_another_is_the_same_texture(toy, copied):
+    points = np.random.default_rng(0).normal(0, 100, (50, 3))
+    again = copied(toy)
+    np.testing.assert_array_equal(again.sample(points, 7), toy.sample(points, 7))
+    assert (again.provider, again.precision, again.threads, again.name) == (toy.provider, toy.precision, toy.threads, toy.name)

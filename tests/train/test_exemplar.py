@@ -12,7 +12,7 @@ import torch
 
 from solidgrain.runtime import ExemplarError
 from solidgrain.train.exemplar import draw_patches, measure_grain, nonstationarity
-from solidgrain.train.photograph import read_exemplar
+from solidgrain.train.photograph import read_exemplar, read_photograph
 from solidgrain.train.settings import preset
 from tests.train.conftest import blotches
 
@@ -61,6 +61,9 @@ def test_colours_are_not_multiplied_by_alpha(tmp_path):
     image.specmod().attribute("oiio:UnassociatedAlpha", 1)
     assert image.write(os.fspath(tmp_path / "rgba.png"), oiio.UINT8)
     assert read_exemplar(tmp_path / "rgba.png", 64)[0, 0, 0] == pytest.approx(200 / 255, abs=1 / 255)
+    assert "is transparent in places" in read_photograph(tmp_path / "rgba.png", 64).warning
+    write(tmp_path / "opaque.png", np.ones((64, 64, 4)))
+    assert read_photograph(tmp_path / "opaque.png", 64).warning == ""
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
