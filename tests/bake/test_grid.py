@@ -100,6 +100,6 @@ def test_flags_that_cannot_work_are_refused_in_one_line(solidgrain, tmp_path, to
 @pytest.mark.parametrize("flat", ["1,0,0,0, 0,1,0,0, 1,1,0,0, 0,0,0,1", "0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,1"])
 def test_a_transform_without_an_inverse_is_refused(solidgrain, tmp_path, toy_folder, flat):
     outcome = solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy", "--transform", flat)
-    assert outcome.code == 1
+    assert outcome.code == 2
     assert "no inverse" in outcome.error
     assert list(tmp_path.iterdir()) == []
