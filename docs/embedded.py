@@ -9,7 +9,7 @@ from solidgrain.export.evaluation import scale_of
 from solidgrain.runtime.bundle import Bundle, embedded_folder, embedded_names, open_bundle
 from solidgrain.runtime.errors import ExemplarError
 from solidgrain.train.exemplar import FloatArray
-from solidgrain.train.photograph import read_exemplar
+from solidgrain.train.photograph import read_photograph, scaled
 from solidgrain.train.quality import SMALLEST
 from solidgrain.train.run import pixels_sha256
 
@@ -26,7 +26,8 @@ def embedded_textures() -> dict[str, Bundle]:
 def exemplar_of(bundle: Bundle) -> dict[str, str]:
     """What the manifest says of the one photograph that a texture was learned from: file name, licence, credit, sha256."""
     entries = bundle.manifest["training"].get("exemplars", [])
-    return {"exemplar": "", "license": "", "credit": "", "sha256": "", **(entries[0] if len(entries) == 1 else {})}
+    unknown = dict.fromkeys(("exemplar", "license", "credit", "sha256", "photograph_sha256"), "")
+    return {**unknown, **(entries[0] if len(entries) == 1 else {})}
 
 
 def find_photograph(bundle: Bundle, folder: Path) -> FloatArray | None:
@@ -35,15 +36,17 @@ def find_photograph(bundle: Bundle, folder: Path) -> FloatArray | None:
     None, with a line, if there is none. Raises ExemplarError if there is one of that name, but with other pixels.
     """
     said = exemplar_of(bundle)
+    whole = said["photograph_sha256"]  # of one that was reduced, which rounds as the processor does
     paths = sorted(path for path in folder.rglob("*") if path.name == said["exemplar"])
     for path in paths:
-        pixels = read_exemplar(path, SMALLEST, scale_of(bundle))
-        if pixels_sha256(pixels) == said["sha256"]:
-            return pixels
+        photograph = read_photograph(path, SMALLEST).pixels
+        exemplar = scaled(photograph, scale_of(bundle))
+        if (pixels_sha256(photograph) == whole) if whole else (pixels_sha256(exemplar) == said["sha256"]):
+            return exemplar
     if paths:
         raise ExemplarError(
             f"{paths[0]}: not the photograph that {bundle.name} was learned from (sha256 of its pixels differs from "
-            f"{said['sha256'][:12]}…, which the manifest expects); name the right folder with --exemplars"
+            f"{(whole or said['sha256'])[:12]}…, which the manifest expects); name the right folder with --exemplars"
         )
     say(f"{bundle.name}: no {said['exemplar'] or 'photograph'} in {folder}; left out")
     return None

@@ -276,7 +276,7 @@ def start(arguments: argparse.Namespace) -> Run:
     """A new run directory for the photograph, with a warning if one texture cannot describe it."""
     from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
     from solidgrain.train.photograph import read_photograph, scaled
-    from solidgrain.train.run import Source, create_run
+    from solidgrain.train.run import Source, create_run, pixels_sha256
 
     if arguments.exemplar is None:
         raise UsageError("no EXEMPLAR given; expected a photograph to learn from, or --space FOLDER")
@@ -286,8 +286,8 @@ def start(arguments: argparse.Namespace) -> Run:
     scale = arguments.patch_scale or 1.0
     if scale < 1:
         raise UsageError(f"--patch-scale {scale:g}: expected 1 or more; photographs are reduced, never enlarged")
-    exemplar, colorspace, warning = read_photograph(arguments.exemplar, round(settings.patch * scale))
-    exemplar = scaled(exemplar, scale)
+    photograph, colorspace, warning = read_photograph(arguments.exemplar, round(settings.patch * scale))
+    exemplar = scaled(photograph, scale)
     if warning:
         print(f"warning: {arguments.exemplar}: {warning}", file=sys.stderr)
     if (found := nonstationarity(exemplar)) > NONSTATIONARY:
@@ -297,7 +297,8 @@ def start(arguments: argparse.Namespace) -> Run:
             file=sys.stderr,
         )
     settings = with_grain(settings, arguments.anisotropic, exemplar)
-    source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace, scale)
+    of_photograph = "" if scale == 1 else pixels_sha256(photograph)
+    source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace, scale, of_photograph)
     return create_run(arguments.out, settings, exemplar, source, make_budget(arguments, settings))
 
 

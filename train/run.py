@@ -47,6 +47,7 @@ class Source:
     credit: str
     colorspace: str = ""  # what its colours were read as, "" in runs that do not say
     scale: float = 1.0  # photograph's pixels per exemplar pixel
+    photograph_sha256: str = ""  # of its pixels before they were reduced, whose average rounds as the processor does
 
 
 @dataclass(frozen=True)

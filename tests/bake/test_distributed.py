@@ -186,7 +186,7 @@ def test_the_command_line_bakes_on_local_processes(solidgrain, toy_folder, tmp_p
     assert outcome.code == 0
     assert outcome.err == ""
     report = json.loads(outcome.out)
-    assert report["files"] == ["b.npy"]
+    assert report["files"] == [str(tmp_path / "b.npy")]
     assert [one["slices"] for one in report["shards"]] == [16, 16, 8]
     assert (tmp_path / "a.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
     assert len(list(tmp_path.iterdir())) == 4

@@ -21,6 +21,7 @@ from docs.embedded import find_photograph
 from solidgrain.export.bundle import Details, write_bundle
 from solidgrain.export.evaluation import Measured
 from solidgrain.runtime import ExemplarError, UsageError, bundle
+from solidgrain.runtime.bundle import open_bundle
 from solidgrain.train import copying
 from solidgrain.train.copying import Copying
 from solidgrain.train.photograph import read_exemplar
@@ -158,6 +159,14 @@ def test_a_photograph_with_other_pixels_is_refused_before_anything_is_measured(m
     monkeypatch.setattr(textures, "measure", None)
     with pytest.raises(ExemplarError, match=r"^.*planks\.png: not the photograph that planks was learned from.*$"):
         run(made, monkeypatch)
+
+
+def test_a_photograph_that_was_reduced_is_known_by_its_own_pixels(tmp_path):
+    path = photograph(tmp_path / "large.png", 0.9)
+    source = {"exemplar": path.name, "scale": 1.5, "sha256": "of another processor"}
+    training = {"exemplars": [{**source, "photograph_sha256": pixels_sha256(read_exemplar(path, 64))}], "settings": {}}
+    write_bundle(tmp_path / "toy", toy_weights(), Details(name="toy", patch=64, training=training))
+    assert find_photograph(open_bundle(tmp_path / "toy"), tmp_path).shape == (43, 43, 3)
 
 
 def test_of_photographs_of_one_name_the_right_one_is_found(made):

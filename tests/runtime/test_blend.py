@@ -379,13 +379,13 @@ def test_another_format_or_version_is_refused(parts, tmp_path, ramp):
     with pytest.raises(BundleError, match="solidgrain-blend version 2, expected solidgrain-blend version 1"):
         load_texture(path)
     write_archive(path, header, {name: array for name, array in arrays.items() if name != "mask"})
-    with pytest.raises(BundleError, match="not a texture file, or damaged"):
+    with pytest.raises(BundleError, match="not a texture file, or a damaged one"):
         load_texture(path)
     ramp.save(path)
     with pytest.raises(BundleError, match="solidgrain-blend version 1, expected solidgrain-texture version 1"):
         read_texture(path)
     path.write_bytes(path.read_bytes()[:-400])
-    with pytest.raises(BundleError, match="not a texture file, or damaged"):
+    with pytest.raises(BundleError, match="not a texture file, or a damaged one"):
         load_texture(path)
 
 

@@ -24,7 +24,7 @@ from solidgrain.train import command, loop
 from solidgrain.train import run as run_module
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.photograph import read_exemplar
-from solidgrain.train.run import Source, create_run, open_run
+from solidgrain.train.run import Source, create_run, open_run, pixels_sha256
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import Budget, preset
 from solidgrain.train.task import SingleExemplar, make_task
@@ -313,6 +313,8 @@ def test_a_photograph_can_be_reduced_and_its_bundle_remembers_by_how_much(solidg
     assert solidgrain("export", tmp_path / "run", "--out", tmp_path / "bundle").code == 0
     bundle = open_bundle(tmp_path / "bundle")
     assert scale_of(bundle) == 2
+    (entry,) = bundle.manifest["training"]["exemplars"]
+    assert entry["photograph_sha256"] == pixels_sha256(read_exemplar(tmp_path / "large.png", 64))
     assert "one pixel for every 2" in (bundle.folder / "card.md").read_text()
 
 
