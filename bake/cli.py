@@ -18,6 +18,8 @@ from collections.abc import Sequence
 from types import FrameType, ModuleType
 from typing import NoReturn
 
+from solidgrain.bake.messages import tell_error
+
 COMMANDS = {
     "bake": ("solidgrain.bake.commands.bake", "evaluate a texture on a voxel grid and write it to files"),
     "merge": ("solidgrain.bake.commands.merge", "complete the files of a plan whose shards have all been baked"),
@@ -143,7 +145,7 @@ def _missing(error: ModuleNotFoundError, command: str | None) -> int:
 
 
 def _fail(message: str) -> int:
-    print(f"solidgrain: {message}", file=sys.stderr)
+    tell_error(message)
     return FAILED
 
 

@@ -14,6 +14,7 @@ from solidgrain.bake.sources import Encoded
 from solidgrain.runtime.errors import UsageError
 
 if TYPE_CHECKING:
+    from solidgrain.bake.baker import Shard
     from solidgrain.bake.plan import Plan
     from solidgrain.runtime import Texture
 
@@ -38,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
         tell(f"{path}: skipped, its files are there")
     if arguments.dry_run:
         encoded.tell_missing()
-        report = describe(plan, texture, plan.shard(*arguments.shard) if arguments.shard else None)
+        report = describe(plan, texture, asked_shard(plan, arguments))
         print(json.dumps(report, indent=2) if arguments.json else summary(report))
         return 0
     try:
@@ -119,6 +120,11 @@ def load_texture(arguments: argparse.Namespace) -> Texture:
     )
 
 
+def asked_shard(plan: Plan, arguments: argparse.Namespace) -> Shard | None:
+    """The slices that --shard asks for, None for all of them."""
+    return plan.shard(*arguments.shard) if arguments.shard else None
+
+
 def to_do(plan: Plan, arguments: argparse.Namespace) -> Plan:
     """The plan without what is done already or must stay, once nothing speaks against it. A dry run removes nothing."""
     from solidgrain.bake.checks import check_plan, without_complete, without_existing
@@ -129,7 +135,7 @@ def to_do(plan: Plan, arguments: argparse.Namespace) -> Plan:
         plan = without_existing(plan)
     if arguments.resume or arguments.update or shared:
         plan = without_complete(plan, discard=not arguments.dry_run)
-    shard = plan.shard(*arguments.shard) if arguments.shard else None
+    shard = asked_shard(plan, arguments)
     goes_on = arguments.resume or arguments.no_clobber or shared
     check_plan(plan, anew, [output for output in plan.outputs if goes_on and is_begun(output.path)], shard)
     if (shared or arguments.resume) and not (arguments.dry_run and anew):  # it would be removed, not refused
@@ -145,7 +151,7 @@ def bake_plan(plan: Plan, texture: Texture, arguments: argparse.Namespace) -> di
     from solidgrain.bake.report import Progress, result
 
     progress = Progress(arguments.quiet)
-    shard, details = plan.shard(*arguments.shard) if arguments.shard else None, {}
+    shard, details = asked_shard(plan, arguments), {}
     try:
         if arguments.dask:
             anew = arguments.overwrite or arguments.update

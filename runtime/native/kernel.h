@@ -1,8 +1,9 @@
 // The fused sampler's C interface: what `solidgrain.runtime.kernel` calls through ctypes.
 //
 // GramGAN Eq. 1 and 5 for any number of points: noise lookup and the whole perceptron, a block of points at a time, with
-// every intermediate value in registers or in the core's own caches (the noise of 32 octaves takes 528 KiB). One sampler is one instance of a texture
-// (its tables, its transforms, its folded weights), made once and then only read, so any number of threads may share it.
+// every intermediate value in registers or in the core's own caches (the noise of 32 octaves takes 528 KiB). One sampler is
+// one instance of a texture (its tables, its transforms, its folded weights), made once and then only read, so any number of
+// threads may share it.
 //
 // A point's colour depends on the sampler and on the point alone: not on its block, its neighbours or the thread.
 #pragma once
