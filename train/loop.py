@@ -90,7 +90,8 @@ class Trainer:
         self.critic.requires_grad_(False)  # the sampler's step needs its activations, not its gradients
         style, adversarial = self._sampler_losses(real, fake)
         color = self._color_loss(batch.colors)
-        sampler_loss = settings.beta * style - settings.alpha * adversarial + settings.color_weight * color
+        alpha = rate(settings.alpha, 0.0, settings.alpha_half_life, self.iteration)
+        sampler_loss = settings.beta * style - alpha * adversarial + settings.color_weight * color
         self._move(self.sampler, self.sampler_optimiser, sampler_loss)
         self.critic.requires_grad_(True)
 

@@ -13,7 +13,8 @@ from solidgrain.runtime.errors import TrainingError
 class Settings:
     """What a run depends on besides its exemplar and its budget; saved as `options.json`.
 
-    Rates follow `rate(k) = max(floor, start * 0.5 ** (k / half_life))` at iteration k; a half-life of 0 keeps them constant.
+    Rates follow `rate(k) = max(floor, start * 0.5 ** (k / half_life))` at iteration k, and alpha likewise, down to 0; a
+    half-life of 0 keeps them constant.
     """
 
     preset: str = "fast"
@@ -43,7 +44,8 @@ class Settings:
     grain_ratio: float = 1.0  # length of the structures across the grain over along it, at the start
 
     # Losses (Eq. 3, Eq. 4)
-    alpha: float = 0.1  # weight of the adversarial term in L_G
+    alpha: float = 0.1  # weight of the adversarial term in L_G, at the start
+    alpha_half_life: float = 0.0  # iterations in which it falls by half; 0: it stays
     beta: float = 1.0  # weight of L_style
     style_features: Literal["critic", "vgg"] = "critic"  # F of L_style: D itself, or a pretrained VGG-16
     penalty: float = 10.0  # lambda, weight of the gradient penalty
@@ -112,6 +114,7 @@ class Budget:
 
 FAST = Settings(
     alpha=0.03,
+    alpha_half_life=400.0,
     critic_contrast=0.15,
     critic_start="stone",
     octaves=32,
@@ -157,6 +160,7 @@ PRESETS = {
         FAST,
         **SPACE,
         alpha=0.1,
+        alpha_half_life=0.0,
         sampler_start="",
         later_patch=0,
         color_weight=0.0,
@@ -179,7 +183,7 @@ def preset(name: str, **changes: Any) -> Settings:
 
 
 def rate(start: float, floor: float, half_life: float, iteration: int) -> float:
-    """The learning rate at an iteration (see `Settings`)."""
+    """The learning rate, or alpha, at an iteration (see `Settings`)."""
     return start if half_life == 0 else max(floor, start * 0.5 ** (iteration / half_life))
 
 

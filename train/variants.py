@@ -25,7 +25,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "paper": {},
     "noise-at-input": {"noise_at_input": True, "sampler_start": ""},  # the embedded space has the method's
     "gan+vgg": {"style_features": "vgg"},
-    "a1b0": {"alpha": 1.0, "beta": 0.0, "color_weight": 0.0},
+    "a1b0": {"alpha": 1.0, "alpha_half_life": 0.0, "beta": 0.0, "color_weight": 0.0},
     "a0b1": {"alpha": 0.0, "beta": 1.0, "color_weight": 0.0},
     "henzler": {
         "noise_at_input": True,

@@ -48,7 +48,7 @@ TITLES = {
 }
 PRESET = "paper-preset"  # the seventh column
 # What the paper weighs against each other is its own, and no method has a head start: the embedded space is the method's.
-SHARED = ("alpha", "gram_energy", "color_weight", "sampler_start", "octaves", "later_patch")
+SHARED = ("alpha", "alpha_half_life", "gram_energy", "color_weight", "sampler_start", "octaves", "later_patch")
 FROM_NOISE = 2e-3  # S's rate at the start: the preset's is for a sampler that begins as a stone
 LOSSES = replace(FAST, sampler_rate=FROM_NOISE, **{name: getattr(PAPER, name) for name in SHARED})
 COLUMNS: dict[str, Settings] = {**{name: vary(LOSSES, name) for name in TITLES}, PRESET: PAPER}

@@ -74,6 +74,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "energy": ("slices compared patch by patch", as_paper("gram_energy")),
     "color-weight": ("no L_color", as_paper("color_weight")),
     "alpha": ("alpha 0.1", as_paper("alpha")),
+    "alpha-falls": ("alpha stays", as_paper("alpha_half_life")),
     "later-patch": ("patches of 64² all along", as_paper("later_patch")),
     "patch": ("patches of 128² all along", as_paper("patch", "later_patch")),
     "batch": ("batches of 16", as_paper("batch")),

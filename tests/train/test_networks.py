@@ -237,7 +237,7 @@ def test_the_paper_preset_is_the_paper_s():
     expected = {
         "octaves": 16, "width": 128, "resolution": 64, "octave_span": 15.0, "orthogonal_start": False,
         "patch": 128, "batch": 16, "rotations": "euler", "transposed": False,
-        "alpha": 0.1, "beta": 1.0, "gram_energy": False, "color_weight": 0.0,
+        "alpha": 0.1, "alpha_half_life": 0.0, "beta": 1.0, "gram_energy": False, "color_weight": 0.0,
         "penalty": 10.0, "penalty_every": 1, "drift": 0.001,
         "critic_rate": 2e-3, "sampler_rate": 5e-4,
     }  # fmt: skip

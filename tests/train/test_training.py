@@ -145,6 +145,25 @@ def test_the_sampler_learns_colours_and_its_octaves_do_not(tmp_path, photograph)
     assert trainer.sampler.directions.requires_grad
 
 
+def test_the_verdict_of_d_weighs_less_as_training_goes_on(tmp_path, photograph):
+    """With a half-life of a hundredth of an iteration, alpha counts in the first iteration and in no other."""
+
+    def gradient(name, first, **changes):
+        trainer = Trainer(new_run(tmp_path / name, photograph, color_weight=0.0, **changes), CPU)
+        trainer.iteration = first
+        trainer.step()
+        return trainer.sampler.output.weight.grad
+
+    for first, like, unlike in ((0, "stays", "none"), (10, "none", "stays")):
+        found = {
+            "stays": gradient(f"stays-{first}", first, alpha=1.0, alpha_half_life=0.0),
+            "falls": gradient(f"falls-{first}", first, alpha=1.0, alpha_half_life=0.01),
+            "none": gradient(f"none-{first}", first, alpha=0.0),
+        }
+        assert torch.equal(found["falls"], found[like])
+        assert not torch.equal(found["falls"], found[unlike])
+
+
 def test_a_run_with_a_checkpoint_is_not_begun_again(tmp_path, photograph, monkeypatch):
     run = new_run(tmp_path / "run", photograph)
     train(run, Budget(iterations=1), CPU)

@@ -54,7 +54,7 @@ def test_a_variant_changes_what_its_name_says_and_nothing_else():
     assert changed("paper") == changed("paper", PAPER) == set()
     assert changed("noise-at-input") == {"noise_at_input", "sampler_start", "sampler_rate", "sampler_rate_floor"}
     assert changed("gan+vgg") == {"style_features"}
-    assert changed("a1b0") == {"alpha", "beta", "color_weight"}
+    assert changed("a1b0") == {"alpha", "alpha_half_life", "beta", "color_weight"}
     assert changed("a0b1") == {"alpha", "color_weight"}
     assert changed("henzler", PAPER) == {"noise_at_input", "rotations", "style_features", "alpha"}
 
