@@ -14,6 +14,10 @@ def tell(line: str) -> None:
     print(line, file=sys.stderr)
 
 
+def warn(line: str) -> None:
+    tell(f"warning: {line}")
+
+
 def tell_error(message: object) -> None:
     tell(f"solidgrain: {message}")
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
-import sys
 from pathlib import Path
+
+from solidgrain.bake.messages import tell
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,5 +37,5 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         size = sum(path.stat().st_size for path in folder.iterdir())
         source = f"PHOTO --bundle {shlex.quote(str(folder))}" if space else shlex.quote(str(folder))
-        print(f"{folder}: {size / 1024:.0f} KB; next: solidgrain bake {source} --size 128 --out out.vti", file=sys.stderr)
+        tell(f"{folder}: {size / 1024:.0f} KB; next: solidgrain bake {source} --size 128 --out out.vti")
     return 0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from solidgrain.bake.arguments import parse_count, parse_positive, parse_seconds, parse_seed
 from solidgrain.bake.flags import add_cut
-from solidgrain.bake.messages import tell, tell_next
+from solidgrain.bake.messages import tell, tell_next, warn
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.space import DEFAULT_SPACE
 from solidgrain.train.command import INTERRUPTED, choose_device
@@ -129,7 +129,7 @@ def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData
 
     photograph = read_photograph(arguments.photo, 1)
     if photograph.warning:
-        tell(f"warning: {arguments.photo}: {photograph.warning}")
+        warn(f"{arguments.photo}: {photograph.warning}")
     cut = Cut(arguments.patch_scale, arguments.crop)
     patch, note = cut_patch(photograph.pixels, space.patch, cut, str(arguments.photo))
     tell(note)
@@ -157,9 +157,9 @@ def say(found: Adapted, space: Space, arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(json.dumps(report, indent=2))
     if found.ended == "diverged":
-        tell(f"warning: L_style diverged at iteration {found.iterations}; the best before that is kept")
+        warn(f"L_style diverged at iteration {found.iterations}; the best before that is kept")
     if found.end >= found.start:
-        tell("warning: L_style has not fallen; the texture is the one that the encoder gives")
+        warn("L_style has not fallen; the texture is the one that the encoder gives")
     spent = f"{found.iterations} iterations, {found.seconds:.0f} s"
     tell(f"L_style {found.start:.4f} -> {found.end:.4f}, {spent} ({WHY[found.ended]})")
     tell_next(arguments.out, found.texture.sampler_sha256, arguments.bundle)

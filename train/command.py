@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive, parse_scale, parse_seed
+from solidgrain.bake.messages import tell, warn
 from solidgrain.runtime.errors import TrainingError, UsageError
 from solidgrain.train.console import Progress, StopRequest
 from solidgrain.train.variants import CHANGES, canonical
@@ -115,7 +115,7 @@ def tell_of_interruption(folder: Path) -> None:
     if not (folder / OPTIONS).exists():
         raise KeyboardInterrupt  # nothing to speak of was begun
     resume = f"solidgrain train --resume {shlex.quote(str(folder))}"
-    print(f"interrupted; go on from its last checkpoint with: {resume}", file=sys.stderr)
+    tell(f"interrupted; go on from its last checkpoint with: {resume}")
 
 
 def train_together(arguments: argparse.Namespace, device: torch.device, processes: Processes) -> int:
@@ -131,7 +131,7 @@ def train_together(arguments: argparse.Namespace, device: torch.device, processe
     progress.end()
     if processes.first:
         flags = budget_flags(arguments) if arguments.resume else ""  # which the run's own budget does not know
-        print(how_to_go_on(training, stopped, ending, flags), file=sys.stderr)
+        tell(how_to_go_on(training, stopped, ending, flags))
     return INTERRUPTED if stopped else 0
 
 
@@ -178,9 +178,9 @@ def begin(arguments: argparse.Namespace, device: torch.device, first: bool) -> R
         training = start_space(arguments) if arguments.space else start(arguments)
         if other:
             taken, left = warm_start(training, other, device)
-            print(f"{arguments.warm_start}: took over {taken} of {taken + left} parameter tensors", file=sys.stderr)
+            tell(f"{arguments.warm_start}: took over {taken} of {taken + left} parameter tensors")
     for line in misgivings(training, arguments.warm_start):
-        print(f"warning: {line}", file=sys.stderr)
+        warn(line)
     return training
 
 
@@ -207,9 +207,6 @@ def start_space(arguments: argparse.Namespace) -> RunFolder:
         raise UsageError("--anisotropic: say x or y; the grain of all photographs of a --space must run the same way")
     if arguments.anisotropic:
         settings = replace(settings, grain=arguments.anisotropic)
-
-    def warn(line: str) -> None:
-        print(f"warning: {line}", file=sys.stderr)
 
     smallest = max(settings.patch, settings.encoded_patch)
     members = read_members(arguments.space, smallest, bool(arguments.skip_unreadable), warn)
@@ -289,12 +286,11 @@ def start(arguments: argparse.Namespace) -> Run:
     photograph, colorspace, warning = read_photograph(arguments.exemplar, round(settings.patch * scale))
     exemplar = scaled(photograph, scale)
     if warning:
-        print(f"warning: {arguments.exemplar}: {warning}", file=sys.stderr)
+        warn(f"{arguments.exemplar}: {warning}")
     if (found := nonstationarity(exemplar)) > NONSTATIONARY:
-        print(
-            f"warning: {arguments.exemplar} changes across itself (nonstationarity {found:.2f}, above {NONSTATIONARY}); "
-            "crop an even part of it for better results",
-            file=sys.stderr,
+        warn(
+            f"{arguments.exemplar} changes across itself (nonstationarity {found:.2f}, above {NONSTATIONARY}); "
+            "crop an even part of it for better results"
         )
     settings = with_grain(settings, arguments.anisotropic, exemplar)
     of_photograph = "" if scale == 1 else pixels_sha256(photograph)

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
+from solidgrain.bake.messages import tell, warn
+
 if TYPE_CHECKING:
     from solidgrain.train.settings import Budget
 
@@ -43,7 +45,7 @@ class StopRequest:
             raise KeyboardInterrupt
         self._requested = True
         if not self._quiet:
-            print("\nfinishing this iteration; once more to stop at once", file=sys.stderr)
+            tell("\nfinishing this iteration; once more to stop at once")
 
 
 class Progress(Generic[Report]):
@@ -68,7 +70,7 @@ class Progress(Generic[Report]):
     def warn(self, warning: str) -> None:
         """A line that stays, whether quiet or not."""
         self.end()
-        print(f"warning: {warning}", file=sys.stderr, flush=True)
+        warn(warning)
 
     def end(self) -> None:
         """What is printed next begins a line of its own."""
