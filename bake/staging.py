@@ -13,7 +13,6 @@ Nothing is believed that its checksum does not confirm. What a kill has cut shor
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import re
@@ -25,7 +24,7 @@ from solidgrain.bake.farm import seen_from
 from solidgrain.bake.plan import Plan, hash_of
 from solidgrain.bake.store import Encoded, Finished, Record, Span, Store, sha256_of
 from solidgrain.runtime.errors import BakeError
-from solidgrain.runtime.files import replacing
+from solidgrain.runtime.files import locked, replacing
 
 LOCK, WORK, PLAN, FINISHED, JOURNAL = "lock", "work.json", "plan.json", "finished.json", "journal"
 
@@ -240,32 +239,20 @@ def open_staging(
 def _lock(folder: Path, output: Path, shard: tuple[int, int] | None) -> list[BinaryIO]:
     """All of the staging, or a share in it and the shard's own part."""
     if shard is None:
-        return [_locked(folder, LOCK, output, fcntl.LOCK_EX)]
-    whole = _locked(folder, LOCK, output, fcntl.LOCK_SH)
+        return [_locked(folder / LOCK, output)]
+    whole = _locked(folder / LOCK, output, shared=True)
     try:
-        return [whole, _locked(folder, f"{LOCK}.{shard[0]:09d}", output, fcntl.LOCK_EX)]
+        return [whole, _locked(folder / f"{LOCK}.{shard[0]:09d}", output)]
     except BaseException:
         whole.close()
         raise
 
 
-def _locked(folder: Path, name: str, output: Path, kind: int) -> BinaryIO:
-    while True:
-        folder.mkdir(exist_ok=True)
-        try:
-            file = open(folder / name, "a+b")  # noqa: SIM115
-        except FileNotFoundError:
-            continue  # its last owner has removed the folder just now
-        try:
-            fcntl.flock(file, kind | fcntl.LOCK_NB)
-            if os.fstat(file.fileno()).st_ino == (folder / name).stat().st_ino:
-                return file
-        except BlockingIOError:
-            file.close()
-            raise BakeError(f"{output}: another process is baking it; wait for it, or write to another name") from None
-        except FileNotFoundError:
-            pass
-        file.close()
+def _locked(path: Path, output: Path, shared: bool = False) -> BinaryIO:
+    try:
+        return locked(path, shared)
+    except BlockingIOError:
+        raise BakeError(f"{output}: another process is baking it; wait for it, or write to another name") from None
 
 
 def check_work(output: Path, work: dict[str, Any]) -> None:

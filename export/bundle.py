@@ -77,7 +77,6 @@ class Details:
 
     name: str
     patch: int  # pixels along each side of a training patch
-    color_encoding: str = "srgb_rec709_scene"
     training: dict[str, Any] = field(default_factory=dict)
     card: str = ""
 
@@ -140,7 +139,7 @@ def _fill(folder: Path, content: SamplerWeights | SpaceWeights, details: Details
         "width": width,
         "hidden_layers": layers,
         "patch": details.patch,
-        "color_encoding": details.color_encoding,
+        "color_encoding": "srgb_rec709_scene",
         "files": {path.name: file_sha256(path) for path in sorted(folder.iterdir())},
         **facts,
         "training": details.training,

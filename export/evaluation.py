@@ -71,9 +71,11 @@ def measure(
 def write_quality(texture: Texture, figures: Figures) -> None:
     """Write the figures into the model card of a texture's bundle. Raises BundleError if that cannot be done."""
     card = texture.bundle.folder / CARD
-    written = card.read_text("utf-8") if card.is_file() else f"# {texture.name}\n"
     try:
+        written = card.read_text("utf-8") if card.is_file() else f"# {texture.name}\n"
         with replacing(card) as file:
             file.write(with_quality(written, figures.markdown()).encode())
+    except UnicodeDecodeError as error:
+        raise BundleError(f"{card}: not UTF-8, so that nothing can be written into it; the figures are as printed") from error
     except OSError as error:
         raise BundleError(f"{card}: cannot write the model card ({error.strerror}); the figures are as printed") from error

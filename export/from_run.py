@@ -22,6 +22,7 @@ from solidgrain.train.settings import to_json
 from solidgrain.train.slices import UNIT
 from solidgrain.train.task import make_task
 
+SEED = 1  # of the noise in which they are compared
 TOLERANCE = 1e-4  # largest difference in colour between torch and ONNX Runtime
 
 
@@ -90,7 +91,7 @@ def sampler_layers(sampler: Sampler) -> tuple[list[FloatArray], list[FloatArray]
 
 
 @torch.no_grad()
-def check_agreement(sampler: Sampler, weights: SamplerWeights, seed: int = 1) -> float:
+def check_agreement(sampler: Sampler, weights: SamplerWeights) -> float:
     """The largest difference in colour between torch, in float64, and ONNX Runtime over random points near and far.
 
     Raises TrainingError if it exceeds `TOLERANCE`.
@@ -98,11 +99,11 @@ def check_agreement(sampler: Sampler, weights: SamplerWeights, seed: int = 1) ->
     octaves = len(weights.transforms)
     texture = TextureData("", "", weights.transforms, weights.gamma, weights.delta, weights.noise_weights)
     model = build_sampler_graph(weights.weights, weights.biases, octaves)
-    exact, tables = copy.deepcopy(sampler).double(), torch.from_numpy(noise_tables(seed, octaves)).double()
-    points = random_points(seed)
-    exact.offsets = torch.from_numpy(noise_offsets(seed, octaves))
+    exact, tables = copy.deepcopy(sampler).double(), torch.from_numpy(noise_tables(SEED, octaves)).double()
+    points = random_points(SEED)
+    exact.offsets = torch.from_numpy(noise_offsets(SEED, octaves))
     expected = exact(tables, torch.from_numpy(points / UNIT)[None])[0].numpy()
-    worst = float(np.abs(run_graph(model, texture, points, seed) - expected).max())
+    worst = float(np.abs(run_graph(model, texture, points, SEED) - expected).max())
     if not worst <= TOLERANCE:
         raise TrainingError(f"torch and ONNX Runtime differ by {worst:.2g} in colour, expected at most {TOLERANCE:g}")
     return worst

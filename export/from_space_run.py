@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from solidgrain.export.bundle import Details, FloatArray, SpaceWeights, run_encoder, run_graph, run_mapping, write_bundle
 from solidgrain.export.card import write_card
 from solidgrain.export.companion import write_companion
-from solidgrain.export.from_run import TOLERANCE, random_points, sampler_layers, trained_state
+from solidgrain.export.from_run import SEED, TOLERANCE, random_points, sampler_layers, trained_state
 from solidgrain.export.sampler_graph import build_sampler_graph
 from solidgrain.export.space_graphs import (
     EncoderWeights,
@@ -33,9 +33,6 @@ from solidgrain.train.settings import to_json
 from solidgrain.train.slices import UNIT
 from solidgrain.train.space import Space
 from solidgrain.train.space_run import SpaceRun, open_space_run
-from solidgrain.train.task import make_task
-
-SEED = 1
 
 
 def export_space_run(run_folder: Path, out: Path, name: str = "", overwrite: bool = False, companion: bool = False) -> Path:
@@ -49,8 +46,7 @@ def export_space_run(run_folder: Path, out: Path, name: str = "", overwrite: boo
     if companion and not run.settings.trains_critic:
         raise TrainingError(f"{run_folder}: --companion: a run with --variant {run.settings.variant} trains no critic")
     state = trained_state(run)
-    average = make_task(run, torch.device("cpu")).make_model(torch.Generator())  # which knows the exemplars' colours
-    assert isinstance(average, Space)
+    average = Space(run.settings, torch.Generator())
     try:
         average.load_state_dict(state["average"])
     except (RuntimeError, TypeError) as error:

@@ -37,6 +37,31 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
 
 
+def locked(path: Path, shared: bool = False) -> BinaryIO:
+    """A lock file in a folder, which is made if it is not there; held until it is closed. Whoever dies lets go of it.
+
+    Raises BlockingIOError if another process holds it, or with `shared` if one holds it alone; OSError.
+    """
+    import fcntl
+
+    while True:
+        path.parent.mkdir(exist_ok=True)
+        try:
+            file = open(path, "a+b")  # noqa: SIM115
+        except FileNotFoundError:
+            continue  # its last owner has removed the folder just now
+        try:
+            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+                return file
+        except FileNotFoundError:
+            pass
+        except OSError:
+            file.close()
+            raise
+        file.close()
+
+
 def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     """Write a NumPy archive. Equal arrays give equal bytes, whatever the day. Raises OSError."""
     with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:

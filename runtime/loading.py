@@ -7,7 +7,7 @@ from pathlib import Path
 
 from solidgrain.runtime.bundle import bundle_folder, open_bundle
 from solidgrain.runtime.space import Space, load_space
-from solidgrain.runtime.texture import DEFAULT_TEXTURE, Texture, load_texture
+from solidgrain.runtime.texture import DEFAULT_TEXTURE, Texture, check_alone, load_texture
 
 
 def load(
@@ -23,5 +23,6 @@ def load(
     Typed code that knows which it is calls `load_texture` or `load_space`.
     """
     if not Path(source).is_file() and open_bundle(bundle_folder(os.fspath(source))).is_space:
+        check_alone(os.fspath(source), bundle)
         return load_space(source, provider=provider, precision=precision, threads=threads)
     return load_texture(source, bundle=bundle, provider=provider, precision=precision, threads=threads)

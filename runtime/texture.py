@@ -76,6 +76,12 @@ def make_workers(threads: int) -> Workers:
     return Workers(count or usable_threads())
 
 
+def check_alone(source: str, bundle: str | os.PathLike[str] | None) -> None:
+    """A bundle needs no other one. Raises BundleError."""
+    if bundle is not None:
+        raise BundleError(f"{source}: is a bundle itself, and --bundle is about texture files; leave {bundle} out")
+
+
 def _resolve(source: str, bundle: str | None) -> tuple[TextureData | BlendData, Bundle]:
     path = Path(source)
     if path.is_file():
@@ -88,8 +94,7 @@ def _resolve(source: str, bundle: str | None) -> tuple[TextureData | BlendData, 
             )
         return data, open_bundle(folder)
     owner = open_bundle(bundle_folder(source))
-    if bundle is not None:
-        raise BundleError(f"{source}: is a bundle itself, and --bundle is about texture files; leave {bundle} out")
+    check_alone(source, bundle)
     if owner.is_space:
         raise BundleError(
             f"{source}: is a space, which holds no texture of its own; "

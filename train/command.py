@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from solidgrain.train.space_run import SpaceRun
 
 FAILED, INTERRUPTED = 1, 130
+MOST_NAMES = 5  # of photographs, in a line
 SMALLEST_PATCH = 32  # pixels
 FIXED = (
     "preset",
@@ -120,9 +122,14 @@ def tell_of_interruption(folder: Path) -> None:
 
 def train_together(arguments: argparse.Namespace, device: torch.device, processes: Processes) -> int:
     """Train in this process, among others perhaps. Returns the exit code; the first process says what happened."""
+    with ExitStack() as stack:
+        training = processes.one_after_another(lambda: begin(arguments, device, stack if processes.first else None))
+        return train_on(training, arguments, device, processes)
+
+
+def train_on(training: RunFolder, arguments: argparse.Namespace, device: torch.device, processes: Processes) -> int:
     from solidgrain.train.loop import train
 
-    training = processes.one_after_another(lambda: begin(arguments, device, processes.first))
     stop = StopRequest(quiet=not processes.first)
     progress = Progress(training.budget, arguments.quiet, describe)
     with processes.errors_once():
@@ -164,14 +171,19 @@ def budget_flags(arguments: argparse.Namespace) -> str:
     return given + " --until-plateau" * bool(arguments.until_plateau)
 
 
-def begin(arguments: argparse.Namespace, device: torch.device, first: bool) -> RunFolder:
-    """The run to train: the one to go on with, or a new one, which the first of several processes makes."""
-    from solidgrain.train.run import undone_on_failure
+def begin(arguments: argparse.Namespace, device: torch.device, stack: ExitStack | None) -> RunFolder:
+    """The run to train: the one to go on with, or a new one.
+
+    The first of several processes, the one with a stack, makes it, and holds it until the stack is left.
+    """
+    from solidgrain.train.run import held, undone_on_failure
     from solidgrain.train.warm_start import learned, warm_start
 
+    if stack:
+        stack.enter_context(held(arguments.resume or arguments.out))
     if arguments.resume:
         return resume(arguments)
-    if not first:
+    if not stack:
         return open_any(arguments.out)
     other = arguments.warm_start and learned(arguments.warm_start)  # before there is a run directory
     with undone_on_failure(arguments.out):
@@ -254,9 +266,9 @@ def about_seen(run: SpaceRun, warm_start: Path | None) -> str:
     return f"{len(names)} held-out photographs were trained on by {teacher}: {some(names)}; hold out others" if names else ""
 
 
-def some(names: Sequence[str], most: int = 5) -> str:
+def some(names: Sequence[str]) -> str:
     """The first of many names."""
-    return ", ".join(names[:most]) + ", ..." * (len(names) > most)
+    return ", ".join(names[:MOST_NAMES]) + ", ..." * (len(names) > MOST_NAMES)
 
 
 def held_out_names(text: str | None) -> int | list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -18,16 +18,14 @@ RotationOf = Callable[[int, torch.Generator], Tensor]  # seed, its random stream
 REACH = 2048  # pixels: slices are taken at random places up to here
 
 
-def cut(
-    sample: Sample, size: int, rotation: Tensor, seed: int, place: Tensor | Sequence[float], spacing: float = 1.0
-) -> FloatArray:
+def cut(sample: Sample, size: int, rotation: Tensor, seed: int, place: Tensor) -> FloatArray:
     """A slice of size x size points through the instance `seed`, [size, size, 3], rows of the image first.
 
-    rotation [3, 3] turns the plane z = 0 about the slice's first point, which lies at `place` (x, y, z); `spacing` is the
-    distance of neighbours. All in exemplar pixels.
+    rotation [3, 3] turns the plane z = 0 about the slice's first point, which lies at `place` [3] (x, y, z). All in exemplar
+    pixels.
     """
-    flat = (flat_slice(size, torch.device("cpu")) * UNIT * spacing).double()
-    points = flat @ rotation.double().T + torch.as_tensor(place, dtype=torch.float64)
+    flat = (flat_slice(size, torch.device("cpu")) * UNIT).double()
+    points = flat @ rotation.double().T + place.double()
     return sample(points.numpy(), seed).reshape(size, size, 3)
 
 

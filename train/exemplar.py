@@ -13,6 +13,7 @@ from solidgrain.train.settings import Settings
 
 FloatArray = npt.NDArray[np.float32]
 
+CORRELATED = 2048  # pixels along each side, of which the autocorrelation is taken
 NONSTATIONARY = 0.3  # above it, one texture cannot describe the image (docs/training.md)
 
 
@@ -53,8 +54,9 @@ class Grain(NamedTuple):
 
 
 def measure_grain(exemplar: FloatArray) -> Grain:
-    """The exemplar's grain, from the distances at which its autocorrelation falls to one half."""
-    grey = exemplar.mean(-1)
+    """The exemplar's grain, from the distances at which the autocorrelation of its middle falls to one half."""
+    top, left = (max(0, extent - CORRELATED) // 2 for extent in exemplar.shape[:2])
+    grey = exemplar[top : top + CORRELATED, left : left + CORRELATED].mean(-1)
     grey = grey - grey.mean()
     spectrum = np.fft.rfft2(grey, s=[2 * extent for extent in grey.shape])  # zero-padded: no wrap-around
     correlation = np.fft.irfft2(np.abs(spectrum) ** 2)

@@ -317,12 +317,12 @@ def train(
         if trainer.iteration % settings.report_every == 0 and processes.first:
             run.append_stats(vars(report))
             on_report(report)
-        if trainer.iteration % settings.sample_every == 0 and processes.first:
-            _write_sample(trainer)
         if budget.until_plateau and trainer.iteration % EVERY == 0:
             trainer.look()
         if due and not trainer.watch.doubt():
             trainer.save()
+        if trainer.iteration % settings.sample_every == 0 and processes.first:  # what cannot be drawn costs no training
+            _write_sample(trainer)
     doubt = trainer.watch.doubt() or trainer.flaw()
     if not doubt:
         trainer.save()

@@ -100,6 +100,11 @@ def scaled(pixels: FloatArray, scale: float) -> FloatArray:
     from solidgrain.bake.color import to_linear, to_srgb
 
     height, width = (max(1, round(extent / scale)) for extent in pixels.shape[:2])
+    if width * height > LARGEST:
+        raise ExemplarError(
+            f"--patch-scale {scale:g}: makes {width}x{height} pixels of the photograph, "
+            f"expected at most {LARGEST >> 20} megapixels; raise it"
+        )
     whole = oiio.ImageBuf(np.ascontiguousarray(to_linear(pixels)))
     smaller = oiio.ImageBufAlgo.resize(whole, "box", 1.0, oiio.ROI(0, width, 0, height, 0, 1, 0, 3))
     linear = np.asarray(smaller.get_pixels(oiio.FLOAT), np.float32)

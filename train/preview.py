@@ -60,9 +60,11 @@ def _write_png(path: Path, image: FloatArray) -> None:
 
     temporary = temporary_name(path)
     buffer = oiio.ImageBuf(np.ascontiguousarray(image))
-    written = buffer.write(os.fspath(temporary), oiio.UINT8)
-    reader = oiio.ImageInput.open(os.fspath(temporary)) if written else None
-    if reader is None or reader.read_image(oiio.UINT8) is None:  # only reading it back shows that the disk was full
+    try:
+        written = buffer.write(os.fspath(temporary), oiio.UINT8)
+        reader = oiio.ImageInput.open(os.fspath(temporary)) if written else None
+        if reader is None or reader.read_image(oiio.UINT8) is None:  # only reading it back shows that the disk was full
+            raise TrainingError(f"{path}: cannot write the sample; make space and go on with --resume")
+        os.replace(temporary, path)
+    finally:
         temporary.unlink(missing_ok=True)
-        raise TrainingError(f"{path}: cannot write the sample; make space and go on with --resume")
-    os.replace(temporary, path)

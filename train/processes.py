@@ -128,9 +128,9 @@ def joined(device: torch.device) -> Iterator[Processes]:
     if dist.is_initialized():
         yield Processes(dist.get_rank(), count)
         return
-    if device.type == "cuda":
-        torch.cuda.set_device(device)
     try:
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=PATIENCE)
     except (RuntimeError, ValueError) as error:
         reason = f"WORLD_SIZE is {count}, but the processes do not meet ({_first_sentence(error)}); start them with torchrun"

@@ -5,6 +5,7 @@ RUN/exemplar.npy     the pixels that it trains on, [H, W, 3] float32
 RUN/stats.jsonl      one line per report: iteration, seconds, losses
 RUN/samples/*.png    the exemplar, an axis-aligned and an oblique slice
 RUN/checkpoint.pt    everything that the next iteration depends on, replaced whole; torch's format, packed (packing.py)
+RUN/lock             while a process trains it
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import io
 import json
 import shutil
 import subprocess
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -25,7 +26,7 @@ import numpy as np
 import torch
 
 from solidgrain.runtime.errors import TrainingError
-from solidgrain.runtime.files import replacing
+from solidgrain.runtime.files import locked, replacing
 from solidgrain.train import settings as settings_module
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.packing import pack, unpack
@@ -34,7 +35,7 @@ from solidgrain.train.settings import Budget, Settings
 PARTS = ("critic", "sampler", "average", "critic_optimiser", "sampler_optimiser")  # the state of each is in a checkpoint
 CHECKPOINT_KEYS = {*PARTS, "iteration", "seconds", "generator"}
 CHECKPOINT, OPTIONS, EXEMPLAR, STATS = "checkpoint.pt", "options.json", "exemplar.npy", "stats.jsonl"
-EXEMPLARS, SAMPLES = "exemplars", "samples"
+EXEMPLARS, SAMPLES, LOCK = "exemplars", "samples", "lock"
 CONTENTS = (CHECKPOINT, OPTIONS, EXEMPLAR, STATS, EXEMPLARS, SAMPLES)
 
 
@@ -159,13 +160,35 @@ def is_space(folder: Path) -> bool:
 
 
 @contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """A run directory, or one that is to be, for this process alone. Raises TrainingError if another one trains it."""
+    absent = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = locked(folder / LOCK)
+    except BlockingIOError as error:
+        raise TrainingError(f"{folder}: another process is training it; wait for it, or choose another --out") from error
+    except OSError as error:
+        raise TrainingError(f"{folder}: cannot write the run directory ({error.strerror})") from error
+    with lock:
+        try:
+            yield
+        finally:
+            (folder / LOCK).unlink(missing_ok=True)
+            remove_empty(absent)
+
+
+@contextmanager
 def creating(folder: Path) -> Iterator[None]:
-    """A run directory in the making. Raises TrainingError if the folder already holds a run or cannot be written.
+    """A run directory in the making. Raises TrainingError if the folder holds a run, or parts of one, or cannot be written.
 
     Whatever goes wrong inside, nothing half-made is left behind.
     """
     if (folder / OPTIONS).exists():
         raise TrainingError(f"{folder}: already holds a run; continue it with --resume {folder}, or choose another --out")
+    for path in (folder / name for name in CONTENTS):  # a checkpoint would be taken up, as this run's own
+        if path.is_file() or (path.is_dir() and any(path.iterdir())):
+            raise TrainingError(f"{path}: is there already, without a run; remove it or choose another --out")
     try:
         with undone_on_failure(folder):
             (folder / SAMPLES).mkdir(parents=True, exist_ok=True)
@@ -189,11 +212,17 @@ def undone_on_failure(folder: Path) -> Iterator[None]:
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
             else:
-                path.unlink(missing_ok=True)
-        with suppress(OSError):  # not empty: something else is in it by now
-            for path in absent:
-                path.rmdir()
+                with suppress(OSError):  # what went wrong first is to be heard
+                    path.unlink(missing_ok=True)
+        remove_empty(absent)
         raise
+
+
+def remove_empty(folders: Sequence[Path]) -> None:
+    """Remove folders, each in the next one, up to the first with something in it."""
+    with suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def write_options(run: RunFolder, specific: dict[str, Any]) -> None:

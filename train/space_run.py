@@ -6,6 +6,7 @@ RUN/exemplars/0000.npy    pixels, [H, W, 3] uint16, in the order of options.json
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,6 @@ from solidgrain.runtime.files import replacing
 from solidgrain.train.collection import Member, choose_held_out
 from solidgrain.train.run import (
     EXEMPLARS,
-    OPTIONS,
     RunFolder,
     Source,
     common_options,
@@ -29,6 +29,8 @@ from solidgrain.train.run import (
     write_options,
 )
 from solidgrain.train.settings import Budget, Settings
+
+OTHER_FILES = 1024  # that a training may have open: libraries, sockets of other processes
 
 
 @dataclass(frozen=True)
@@ -63,10 +65,8 @@ def create_space_run(
     `source` gives the licence and the credit of them all. Raises TrainingError if the folder already holds a run or cannot be
     written, ExemplarError if the members cannot be trained on.
     """
-    if (folder / EXEMPLARS).exists() and not (folder / OPTIONS).exists():
-        raise TrainingError(f"{folder / EXEMPLARS}: is there already, without a run; remove it or choose another --out")
     with creating(folder):
-        (folder / EXEMPLARS).mkdir()
+        (folder / EXEMPLARS).mkdir(exist_ok=True)
         entries: list[dict[str, Any]] = []
         for number, member in enumerate(members):
             with replacing(_file(folder, number)) as file:
@@ -87,17 +87,26 @@ def open_space_run(folder: Path) -> SpaceRun:
         if "exemplars" not in options:
             raise TrainingError(f"{folder}: the run of a single exemplar; expected one of a texture space")
         entries = options["exemplars"]
+        allow_open_files(len(entries))
         members = tuple(_read_member(_file(folder, number), entry) for number, entry in enumerate(entries))
         held_out = frozenset(entry["exemplar"] for entry in entries if entry["held_out"])
         common = common_options(folder, options)
         return SpaceRun(*common, members, held_out, str(options["license"]), str(options["credit"]))
 
 
+def allow_open_files(count: int) -> None:
+    """Let this process have so many files open besides its others, as far as it may: a memory-mapped array keeps its own."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = count + OTHER_FILES if hard == resource.RLIM_INFINITY else min(count + OTHER_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
 def _read_member(path: Path, entry: dict[str, Any]) -> Member:
     try:
         pixels = np.lib.format.open_memmap(path, mode="r")
     except (OSError, ValueError, EOFError) as error:
-        raise TrainingError(f"{path}: missing or damaged; put it back, or start the run again elsewhere") from error
+        raise TrainingError(f"{path}: missing or damaged ({error}); put it back, or start the run again elsewhere") from error
     if pixels_sha256(pixels) != entry["sha256"]:
         raise TrainingError(f"{path}: not the pixels that the run was started with (sha256 differs)")
     down, across = entry["wraps"]

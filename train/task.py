@@ -142,14 +142,14 @@ class TextureSpace:
         self.noise = Noise(run.settings, device)
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
-        space = Space(self.settings, generator)
-        if self.settings.principal_colors:  # axes that all have in common; mean and contrast are each texture's own
-            device = generator.device
-            space.sampler.take_colors(torch.zeros(3, device=device), collection.mean_covariance(self.members).to(device))
-        return space
+        return Space(self.settings, generator)
 
     def begin(self, model: nn.Module) -> None:
-        """As it was made."""
+        """Give it the axes that all colours have in common; mean and contrast are each texture's own."""
+        if self.settings.principal_colors:
+            assert isinstance(model, Space)
+            mean = torch.zeros(3, device=self.device)
+            model.sampler.take_colors(mean, collection.mean_covariance(self.members).to(self.device))
 
     def draw(self, iteration: int, generator: torch.Generator) -> Batch:
         settings, device = self.settings, self.device

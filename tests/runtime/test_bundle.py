@@ -237,3 +237,8 @@ def test_a_bundle_that_cannot_be_replaced_stays(tmp_path, monkeypatch, where):
         write_bundle(folder, toy_weights(seed=2), Details(name="toy", patch=64), overwrite=True, **more)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["toy"]
+
+
+def test_a_space_is_a_bundle_itself():
+    with pytest.raises(BundleError, match="stone: is a bundle itself, and --bundle is about texture files; leave nope out"):
+        load("stone", bundle="nope")

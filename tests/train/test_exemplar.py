@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from solidgrain.runtime import ExemplarError
+from solidgrain.train import exemplar
 from solidgrain.train.exemplar import draw_patches, measure_grain, nonstationarity
-from solidgrain.train.photograph import read_exemplar, read_photograph
+from solidgrain.train.photograph import read_exemplar, read_photograph, scaled
 from solidgrain.train.settings import preset
 from tests.train.conftest import blotches
 
@@ -157,6 +158,19 @@ def test_the_grain_of_stripes_is_along_them():
     assert measure_grain(stripes).axis == "x"
     assert measure_grain(stripes.transpose(1, 0, 2)).axis == "y"
     assert measure_grain(stripes).ratio < 0.2
+
+
+def test_the_grain_of_a_large_photograph_is_that_of_its_middle(monkeypatch):
+    monkeypatch.setattr(exemplar, "CORRELATED", 64)
+    rows = np.repeat(np.random.default_rng(0).random((128, 1, 1)), 192, axis=1)
+    across = np.broadcast_to(np.random.default_rng(1).random((1, 192, 1)), rows.shape).copy()
+    across[32:96, 64:128] = rows[32:96, 64:128]
+    assert measure_grain(across.astype(np.float32)).axis == "x"
+
+
+def test_a_photograph_is_not_enlarged_beyond_all_bounds():
+    with pytest.raises(ExemplarError, match="makes 64000x32000 pixels of the photograph, expected at most 64 megapixels"):
+        scaled(blotches(32, 64), 0.001)
 
 
 def test_nonstationarity_tells_a_gradient_from_an_even_texture():

@@ -136,6 +136,8 @@ def test_processes_that_do_not_find_each_other_say_so(monkeypatch):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(TrainingError, match=r"WORLD_SIZE is 2, but .*; start them with torchrun"), joined(CPU):
         pass
+    with pytest.raises(TrainingError, match="start them with torchrun"), joined(torch.device("cuda")):  # of no number
+        pass
 
 
 def said(stderr):

@@ -119,6 +119,10 @@ def test_the_command_measures_a_bundle_and_writes_its_card(solidgrain, toy_folde
     assert "Copying: patches are" in outcome.out
     solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
     assert (folder / "card.md").read_text().count("## Quality") == 1
+    (folder / "card.md").write_bytes(b"caf\xe9")
+    outcome = solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
+    assert outcome.code == 1
+    assert "card.md: not UTF-8, so that nothing can be written into it" in outcome.err
 
 
 def test_a_card_that_cannot_be_written_is_one_line_after_the_figures(solidgrain, toy_folder, tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import time
 
 import numpy as np
@@ -308,6 +309,17 @@ def test_exemplars_that_are_there_already_are_not_overwritten(tmp_path):
     with pytest.raises(TrainingError, match="exemplars: is there already, without a run; remove it or choose another --out"):
         new_space(tmp_path / "run")
     assert inside(tmp_path / "run") == {mine.relative_to(tmp_path / "run"): b"mine"}
+
+
+def test_as_many_exemplars_can_be_open_as_the_system_allows():
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (64, before[1]))
+        space_run.allow_open_files(80)
+        assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] >= min(80, before[1])
+        assert resource.getrlimit(resource.RLIMIT_NOFILE)[1] == before[1]
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
 def test_a_run_that_is_there_already_is_not_to_be_removed(tmp_path):

@@ -189,6 +189,45 @@ def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, photograph):
     assert_same_checkpoint(folder, tmp_path / "whole")
 
 
+def test_two_processes_cannot_train_the_same_run(tmp_path, photograph, solidgrain):
+    folder = tmp_path / "run"
+    new_run(folder, photograph)
+    process = endless_training(folder)
+    deadline = time.monotonic() + 120
+    while not (folder / "checkpoint.pt").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    for second in (("--resume", folder), (photograph, "--out", folder)):
+        outcome = solidgrain("train", *second, "--iterations", 1, "--threads", 1)
+        assert (outcome.code, outcome.err) == (
+            1, f"solidgrain: {folder}: another process is training it; wait for it, or choose another --out\n"
+        )  # fmt: skip
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert "stopped and saved" in said
+    assert not (folder / "lock").exists()
+    numbers = [line["iteration"] for line in losses(folder)]
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "exemplar.npy", "samples/000500.png"])
+def test_what_another_run_has_left_is_not_taken_for_this_one_s(tmp_path, photograph, name):
+    left = tmp_path / "run" / name
+    left.parent.mkdir(parents=True)
+    left.write_text("mine")
+    with pytest.raises(TrainingError, match="is there already, without a run; remove it or choose another --out"):
+        new_run(tmp_path / "run", photograph)
+    assert left.read_text() == "mine"
+
+
+def test_a_file_in_the_place_of_a_run_is_named(tmp_path, photograph, solidgrain):
+    (tmp_path / "run").write_text("mine")
+    outcome = solidgrain("train", photograph, "--out", tmp_path / "run", "--iterations", 1)
+    assert (outcome.code, outcome.err) == (
+        1, f"solidgrain: {tmp_path / 'run'}: cannot write the run directory (File exists)\n"
+    )  # fmt: skip
+    assert (tmp_path / "run").read_text() == "mine"
+
+
 def test_half_a_line_of_statistics_is_dropped_on_resume(tmp_path, photograph):
     folder = tmp_path / "run"
     train(new_run(folder, photograph), Budget(iterations=4), CPU)
