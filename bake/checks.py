@@ -41,7 +41,11 @@ def check_plan(plan: Plan, overwrite: bool, begun: Sequence[Output] = (), shard:
 def without_existing(plan: Plan) -> Plan:
     """The plan without the outputs of which a file exists (`--no-clobber`), unless a kill left the rest of them to be done."""
     _check_memory(plan)
-    kept = [output for output in plan.outputs if is_begun(output.path) or not output_exists(output, plan.volume)]
+
+    def begun(output: Output) -> bool:
+        return is_begun(output.path) and not is_foreign(output.path, plan.work(output))
+
+    kept = (output for output in plan.outputs if begun(output) or not output_exists(output, plan.volume))
     return replace(plan, outputs=tuple(kept))
 
 
@@ -68,7 +72,7 @@ def _check_file(path: Path, overwrite: bool, taken: set[Path]) -> None:
     _check_name(path, taken)
     if path.is_dir():
         raise BakeError(f"{path}: is a folder, expected a file name")
-    if not overwrite and path.exists():
+    if not overwrite and os.path.lexists(path):  # a link to nowhere is somebody's, too
         raise BakeError(f"{path}: already exists; use --overwrite to replace it (or, of bake, --no-clobber to keep it)")
 
 

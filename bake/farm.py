@@ -19,12 +19,17 @@ def anywhere(plan: Plan) -> Plan:
 def seen_from(folder: Path, plan: Plan) -> Plan:
     """`anywhere`, but what lies in `folder` goes by its name alone: it may be moved, or be seen elsewhere.
 
-    That is for a plan in a file of this folder; `load_plan` undoes it.
+    A texture or bundle there is `./name`, for `name` may be an embedded one's. That is for a plan in a file of this folder;
+    `load_plan` undoes it.
     """
-    plan, folder = anywhere(plan), folder.absolute()
-    outputs = (replace(one, path=Path(one.path.name)) if one.path.parent == folder else one for one in plan.outputs)
-    source = Path(plan.source)
-    return replace(plan, outputs=tuple(outputs), source=source.name if source.parent == folder else plan.source)
+    plan, folder = anywhere(plan), folder.resolve()
+
+    def near(source: str) -> str:
+        path = Path(source)
+        return f"./{path.name}" if path.is_absolute() and path.parent.resolve() == folder else source
+
+    outputs = (replace(one, path=Path(one.path.name)) if one.path.parent.resolve() == folder else one for one in plan.outputs)
+    return replace(plan, outputs=tuple(outputs), source=near(plan.source), bundle=plan.bundle and near(plan.bundle))
 
 
 def shard_count(plan: Plan, asked: int | None) -> int:

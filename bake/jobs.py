@@ -101,6 +101,8 @@ def _of_use(defaults: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     written = {formats()[kind_of(path)].name for path in paths}
     others = (row for row in formats().values() if row.name not in written)
     unused = {f"{row.name}_{option.name}".replace("-", "_") for row in others for option in row.options}
+    if not paths:
+        unused |= {"mips", "mip_filter", "colorspace", "dither", "for"}  # a preview has none of these
     return {key: value for key, value in defaults.items() if key not in unused}
 
 
@@ -151,11 +153,16 @@ def _flat(value: Any) -> Iterator[Any]:
 
 def _source(name: str | None, folder: Path) -> str | None:
     """A texture or bundle by its embedded name, or by its path from the job file's folder."""
-    from solidgrain.runtime.bundle import embedded_bundles
+    from solidgrain.bake.plan import is_there
+    from solidgrain.runtime.bundle import embedded_bundles, embedded_folder
 
-    if name is None or name in embedded_bundles():
-        return name
-    return os.fspath(folder / name) if os.sep in name or (folder / name).exists() else name
+    if name is None:
+        return None
+    if name not in embedded_bundles():
+        return os.fspath(folder / name) if os.sep in name or (folder / name).exists() else name
+    if is_there(folder / name):
+        return os.fspath(folder / name)
+    return os.fspath(embedded_folder(name)) if is_there(Path(name)) else name  # not what lies in the working folder
 
 
 def plan_jobs(
@@ -190,7 +197,7 @@ def _with_settings(plan: Plan, job: Job) -> Plan:
 
     outputs = []
     for output in plan.outputs:
-        own = job.settings.get(output.path, {})
+        own = {"engine" if key == "for" else key: value for key, value in job.settings.get(output.path, {}).items()}
         if own.get("engine") and "axes" not in own:
             own = {**own, "axes": axes_for(str(own["engine"]), output.kind)}
         outputs.append(checked_output(output, f"out {output.path.name}", **own))

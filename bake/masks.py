@@ -57,9 +57,9 @@ def _image_data(path: Path) -> MaskFile:
         raise BakeError(f"--mask {path}: its axes are turned, expected x, y and z; resample it")
     at_points = len(image.point_data) == 1
     columns, rows, planes = (extent if at_points else max(1, extent - 1) for extent in image.dimensions)
-    x, y, z = (
-        float(start) - 0.5 * step if at_points else float(start)
-        for start, step in zip(image.origin, image.spacing, strict=True)
+    x, y, z = (  # the origin is where index 0 would be, and a part of a larger volume begins elsewhere
+        float(start) + (first - 0.5 * at_points) * step
+        for start, first, step in zip(image.origin, image.extent[::2], image.spacing, strict=True)
     )
     spacing = tuple(float(step) for step in image.spacing)
     return MaskFile(np.array(arrays[0][1]).reshape(planes, rows, columns), (x, y, z), (spacing[0], spacing[1], spacing[2]))

@@ -35,9 +35,14 @@ def load_plan(path: Path) -> Plan:
 
 def seen_in(folder: Path, plan: Plan) -> Plan:
     """A plan from a file in this folder, by absolute paths: of its outputs, and of a texture or bundle that lies there."""
+    from solidgrain.runtime.bundle import embedded_bundles
+
+    def here(source: str) -> str:
+        path = (folder / source).absolute()
+        return str(path) if source not in embedded_bundles() and is_there(path) else source
+
     outputs = (replace(output, path=(folder / output.path).absolute()) for output in plan.outputs)
-    source = (folder / plan.source).absolute()
-    return replace(plan, outputs=tuple(outputs), source=str(source) if is_there(source) else plan.source)
+    return replace(plan, outputs=tuple(outputs), source=here(plan.source), bundle=plan.bundle and here(plan.bundle))
 
 
 def plan_of(values: Any, where: str, place: str = "") -> Plan:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -155,8 +156,14 @@ class Encoded:
 
         used = {plan.source for plan in plans if not leaves_nothing(plan)}
         for file in self.made:
-            if str(file) not in used:
+            if str(file) not in used and not _named_beside(file):
                 file.unlink(missing_ok=True)
+
+
+def _named_beside(file: Path) -> bool:
+    """Whether a bake in a texture file's folder, done or begun, is of it: another process may have found it there."""
+    bakes = (*file.parent.glob("*.bake.json"), *file.parent.glob(".*.baking/plan.json"))
+    return any(json.dumps(f"./{file.name}") in path.read_text("utf-8", "replace") for path in bakes)
 
 
 def _precision(arguments: argparse.Namespace) -> str:

@@ -131,7 +131,10 @@ def _add(plotter: Any, image: pyvista.ImageData, mode: str, interactive: bool) -
         if interactive:
             plotter.add_slider_widget(keep_brighter, rng=(0, 255), value=middle, title="luma", color="white")
     else:
-        plotter.add_mesh(image.extract_surface(algorithm="dataset_surface"), scalars="rgb", rgb=True)
+        surface = image.extract_surface(algorithm="dataset_surface")
+        if not surface.n_points:
+            raise ViewError(f"--mode block: a row of {image.n_points} voxels has no surface; try --mode slices")
+        plotter.add_mesh(surface, scalars="rgb", rgb=True)
 
 
 def luma(image: pyvista.ImageData) -> npt.NDArray[np.uint8]:

@@ -19,8 +19,8 @@ LARGE = 2**31 - 2**20  # bytes: from here on, an archive's member needs 64-bit s
 
 
 def temporary_name(path: Path) -> Path:
-    """A hidden name beside the file, this process's own, with the same suffix."""
-    return path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    """A hidden name beside the file that nobody else has, with the same suffix. Processes in containers share numbers."""
+    return path.with_name(f".{path.stem}.{os.urandom(8).hex()}.tmp{path.suffix}")
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from solidgrain.runtime.errors import UsageError
 if TYPE_CHECKING:
     from solidgrain.bake.baker import Shard
     from solidgrain.bake.plan import Plan
+    from solidgrain.bake.writers import Output, Volume
     from solidgrain.runtime import Texture
 
 __all__ = ["add_arguments", "run"]
@@ -34,9 +36,10 @@ def run(arguments: argparse.Namespace) -> int:
     if not plan.outputs and not arguments.dry_run:
         raise UsageError("nothing to write: give at least one --out FILE or --preview FILE.png")
     asked, plan = plan, to_do(plan, arguments)
-    skipped = [str(output.path) for output in asked.outputs if output not in plan.outputs]
-    for path in [] if arguments.quiet else skipped:
-        tell(f"{path}: skipped, its files are there")
+    left_out = [output for output in asked.outputs if output not in plan.outputs]
+    skipped = [str(output.path) for output in left_out]
+    for output in [] if arguments.quiet else left_out:
+        tell(f"{output.path}: skipped, {present(output, asked.volume)}")
     if arguments.dry_run:
         encoded.tell_missing()
         report = describe(plan, texture, asked_shard(plan, arguments))
@@ -56,6 +59,17 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def present(output: Output, volume: Volume) -> str:
+    """How many of an output's files are there."""
+    from solidgrain.bake.writers import output_files
+
+    files = output_files(output, volume)
+    count = sum(os.path.lexists(path) for path in files)
+    return (
+        "its files are there" if count == len(files) else f"{count} of its {len(files)} files are there; --update completes it"
+    )
+
+
 def planned(arguments: argparse.Namespace, encoded: Encoded) -> tuple[Plan, Texture]:
     """The plan that the flags ask for, or the one that --plan names, and its texture."""
     if arguments.plan is None:
@@ -66,6 +80,10 @@ def planned(arguments: argparse.Namespace, encoded: Encoded) -> tuple[Plan, Text
     from solidgrain.bake.schema import load_plan
     from solidgrain.bake.verify import check_texture
 
+    if encoded.load(arguments):
+        raise UsageError(
+            f"--plan {arguments.plan}: takes a texture file for SOURCE; solidgrain encode makes one of the photograph"
+        )
     plan = load_plan(arguments.plan)
     source, bundle = (given and located(given) for given in (arguments.source, arguments.bundle))
     plan = replace(plan, source=source or plan.source, bundle=bundle or plan.bundle)

@@ -23,12 +23,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.runtime import Texture, load
+    from solidgrain.runtime.blend_file import BlendData
     from solidgrain.runtime.probe import TOLERANCE, probe_error
 
     loaded = load(arguments.source, bundle=arguments.bundle)
     error = probe_error(loaded.bundle)
     kind = "texture" if isinstance(loaded, Texture) else "space"
     report = {**loaded.bundle.manifest, kind: loaded.name, "folder": str(loaded.bundle.folder), "probe_error": error}
+    if isinstance(loaded, Texture):
+        report |= {"texture_sha256": loaded.data.sha256, "provider": loaded.provider, "provider_note": loaded.provider_note}
+        report |= {"blend": _blend(loaded.data)} if isinstance(loaded.data, BlendData) else {}
     print(json.dumps(report, indent=2) if arguments.json else summary(loaded, error, error <= TOLERANCE))
     return 0 if error <= TOLERANCE else 3
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.color import SRGB
+from solidgrain.bake.color import LINEAR, SRGB
 from solidgrain.bake.store import Bytes, Encoded, Finished, Store
 from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
 from solidgrain.bake.writers.exr import color_attributes
@@ -123,7 +123,8 @@ class AtlasFile(Writer):
 
         half = self.dtype == np.float16
         spec = oiio.ImageSpec(tiles.width, tiles.height, 3, "half" if half else "uint8")
-        spec.attribute("oiio:ColorSpace", self.output.colorspace)
+        if half or self.output.colorspace in (SRGB, LINEAR):  # of others OpenImageIO would write a PNG's gamma alone
+            spec.attribute("oiio:ColorSpace", self.output.colorspace)
         spec.attribute("Software", "solidgrain")
         spec.attribute("DateTime", "")  # no time stamp: equal volumes are equal bytes
         spec.attribute("png:compressionLevel", 4)  # 6 takes up to three times as long for 4 % less

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +83,8 @@ class ExrStack(Writer):
         values = np.empty((len(voxels), 3), np.float32)
         for z in np.unique(voxels[:, 2]):
             here = voxels[:, 2] == z
-            with OpenEXR.File(os.fspath(self.paths[z]), separate_channels=True) as file:
+            # opened here, for OpenEXR takes no name that is not UTF-8
+            with open(self.paths[z], "rb") as stream, OpenEXR.File(stream, separate_channels=True) as file:
                 channels = file.channels()
                 for k, source in enumerate("rgb"):
                     values[here, k] = channels[names[source]].pixels[voxels[here, 1], voxels[here, 0]]
@@ -106,6 +106,7 @@ def slice_header(output: Output, volume: Volume, z: int) -> dict[str, Any]:
         "compression": getattr(OpenEXR, f"{written}_COMPRESSION"),
         "type": OpenEXR.scanlineimage,
         **color_attributes(output),
+        "pixelAspectRatio": volume.spacing[0] / volume.spacing[1],
         "solidgrain:texture": volume.texture,
         "solidgrain:model": volume.sampler_sha256,
         "solidgrain:seed": str(volume.seed),  # may exceed an EXR int

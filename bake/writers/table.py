@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ class Format:
     files: Callable[[Output, Volume], list[Path]] = lambda output, volume: [output.path]
     options: tuple[Option, ...] = ()
     scratch: Callable[[Output], int] = lambda output: 0  # bytes per voxel that its staging holds besides the final files
+    linear_types: tuple[str, ...] = ()  # of its option `type`, those whose colours are linear instead: no header says sRGB
     levels_inside: bool = False  # mip levels are in the file itself
     check: Callable[[Output, Volume], None] = lambda output, volume: None  # raises UsageError or BakeError
 
@@ -43,7 +45,16 @@ def formats() -> dict[str, Format]:
         ".vti": Format("vti", vti.VtiFile, vti.size, SRGB, options=vti.OPTIONS),
         ".npy": Format("npy", npy.NpyFile, npy.size, SRGB),
         ".vdb": Format("vdb", vdb.VdbFile, vdb.size, LINEAR, options=vdb.OPTIONS, scratch=vdb.scratch, check=vdb.check),
-        ".dds": Format("dds", dds.DdsFile, dds.size, SRGB, options=dds.OPTIONS, levels_inside=True, check=dds.check),
+        ".dds": Format(
+            "dds",
+            dds.DdsFile,
+            dds.size,
+            SRGB,
+            options=dds.OPTIONS,
+            linear_types=("rgba16f",),
+            levels_inside=True,
+            check=dds.check,
+        ),
         ".raw": Format("raw", raw.RawFile, raw.size, SRGB, raw.files, raw.OPTIONS),
         ".atlas.png": atlas_of(SRGB),
         ".atlas.exr": atlas_of(LINEAR),
@@ -71,7 +82,7 @@ def make_output(path: Path, kind: str = "", /, **options: str | int) -> Output:
     kind = kind or kind_of(path)
     row = formats()[kind]
     known = {option.name: option.default for option in row.options} | {
-        "colorspace": row.colorspace,
+        "colorspace": LINEAR if options.get("type") in row.linear_types else row.colorspace,
         "colorconfig": "",
         **COMMON,
     }
@@ -163,7 +174,7 @@ def check_output(output: Output, volume: Volume) -> None:
 
 def output_exists(output: Output, volume: Volume) -> bool:
     """Whether any file of an output exists already."""
-    return any(path.exists() for path in output_files(output, volume))
+    return any(os.path.lexists(path) for path in output_files(output, volume))
 
 
 def clips(output: Output) -> bool:

@@ -10,6 +10,7 @@ import sys
 import time
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from solidgrain.export.bundle import Details, write_bundle
@@ -155,6 +156,24 @@ def test_one_existing_slice_is_enough_to_refuse_a_stack(solidgrain, tmp_path, to
     outcome = solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.####.exr")
     assert "a.0003.exr: already exists" in outcome.error
     assert len(list(tmp_path.iterdir())) == 1
+    kept = solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.####.exr", "--no-clobber")
+    assert "skipped, 1 of its 4 files are there; --update completes it" in kept.error
+
+
+def test_a_link_to_nowhere_is_somebody_s(solidgrain, tmp_path, toy_folder):
+    (tmp_path / "a.npy").symlink_to("/nonexistent/store/a.npy")
+    assert "a.npy: already exists" in solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy").error
+    assert solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy", "--no-clobber").code == 0
+    assert (tmp_path / "a.npy").is_symlink()
+
+
+def test_a_plan_takes_no_photograph(solidgrain, tmp_path, toy_folder, toy_space_folder):
+    oiio.ImageBuf(np.full((128, 128, 3), 0.5, np.float32)).write(str(tmp_path / "photo.png"), oiio.UINT8)
+    assert solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy").code == 0
+    flags = ("--plan", tmp_path / "a.npy.bake.json", "--overwrite", "--bundle", toy_space_folder)
+    outcome = solidgrain("bake", tmp_path / "photo.png", *flags)
+    assert outcome.code == 2
+    assert "takes a texture file for SOURCE; solidgrain encode makes one of the photograph" in outcome.err
 
 
 def test_an_unwritable_folder_is_refused(solidgrain, tmp_path, toy_folder, monkeypatch):

@@ -160,18 +160,19 @@ def test_a_mask_that_has_changed_is_another_texture_to_a_plan(blend, solidgrain,
     assert "made with the texture" in outcome.error
 
 
-@pytest.mark.parametrize("kind", ["npy", "points.vti", "cells.vti"])
+@pytest.mark.parametrize("kind", ["npy", "points.vti", "cells.vti", "part.points.vti", "part.cells.vti"])
 def test_a_mask_comes_from_a_file_with_its_place(blend, folder, textures, space, tmp_path, kind):
     values = np.random.default_rng(0).random((2, 3, 4), np.float32)
     path, flags = tmp_path / f"mask.{kind}", ["--mask-origin", "1,-2,3", "--mask-spacing", "2,3,4"]
     if kind == "npy":
         np.save(path, values)
     else:
-        at_points, flags = kind == "points.vti", []
+        at_points, flags, first = kind.endswith("points.vti"), [], np.array([5, 0, 7]) * kind.startswith("part")
         extent = np.array([4, 3, 2]) + (not at_points)
         image = pyvista.ImageData(
-            dimensions=extent, spacing=(2, 3, 4), origin=np.array([1, -2, 3]) + at_points * np.array([1, 1.5, 2])
+            spacing=(2, 3, 4), origin=np.array([1, -2, 3]) + (0.5 * at_points - first) * np.array([2, 3, 4])
         )
+        image.extent = np.stack([first, first + extent - 1], 1).reshape(-1)  # of a larger volume, whose index 0 is elsewhere
         (image.point_data if at_points else image.cell_data)["weight"] = values.reshape(-1)
         image.save(path)
     outcome = blend("--mask", path, *flags, "--out", tmp_path / "ab.sgt.npz", "--json")

@@ -76,7 +76,7 @@ def test_a_photograph_bakes_as_the_texture_that_is_saved_beside_it(solidgrain, t
     volume = np.load(tmp_path / "cliff.npy")
     np.testing.assert_allclose(volume, texture.grid((8, 8, 8)), atol=1 / 255)
     photograph_is_gone = json.loads((tmp_path / "cliff.npy.bake.json").read_text())["plan"]["source"]
-    assert photograph_is_gone == "cliff.sgt.npz"
+    assert photograph_is_gone == "./cliff.sgt.npz"
     assert solidgrain("verify", tmp_path / "cliff.npy").code == 0
     assert solidgrain("bake", photograph, *flags, "--resume").code == 0
 
@@ -126,6 +126,20 @@ def test_a_bake_that_fails_leaves_no_texture_unless_it_can_be_resumed(
     monkeypatch.setattr("solidgrain.bake.baker.evaluate", fail)
     assert solidgrain(*flags, "--overwrite", "--seed", 1).code in (1, 130)
     assert (tmp_path / "cliff.sgt.npz").is_file()  # it was there before
+
+
+def test_a_texture_that_another_bake_has_found_stays(solidgrain, toy_space_folder, photograph, tmp_path, monkeypatch):
+    flags = ("bake", photograph, "--bundle", toy_space_folder, "--size", "4", "--quiet", "--out")
+
+    def fail(*arguments):
+        monkeypatch.undo()
+        assert solidgrain(*flags, tmp_path / "b.npy").code == 0
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("solidgrain.bake.baker.evaluate", fail)
+    assert solidgrain(*flags, tmp_path / "a.npy").code == 130
+    assert solidgrain("verify", tmp_path / "b.npy").code == 0
+    assert (tmp_path / "cliff.sgt.npz").is_file()
 
 
 def test_a_texture_is_kept_if_one_of_its_jobs_is_baked(solidgrain, toy_space_folder, photograph, tmp_path, monkeypatch):

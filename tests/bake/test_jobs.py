@@ -12,6 +12,8 @@ from solidgrain.bake.flags import make_outputs
 from solidgrain.bake.jobs import read_jobs
 from solidgrain.bake.writers import Output
 from solidgrain.export.bundle import Details, write_bundle
+from solidgrain.runtime import load_texture
+from solidgrain.runtime.bundle import embedded_folder
 from tests.toy import toy_weights
 
 TINY = {"size": [6, 5, 4]}
@@ -106,16 +108,19 @@ def test_a_setting_holds_for_all_outputs_of_its_format_and_an_outputs_own_comes_
 def test_defaults_are_for_the_jobs_that_have_a_use_for_them(solidgrain, write_jobs):
     path = write_jobs({"name": "a", "out": "a.vti"}, {"name": "b", "out": ["b.####.exr"]}, exr_compression="piz")
     assert solidgrain("bake", "--jobs", path, "--quiet").code == 0
+    preview = {"name": "a", "preview": "a.png"}
+    path = write_jobs(preview, mips=True, mip_filter="box", colorspace="ACEScg", dither=True, **{"for": "unity"})
+    assert solidgrain("bake", "--jobs", path, "--quiet").code == 0
     path = write_jobs({"name": "a", "out": "a.vti", "exr_compression": "piz"})
     assert "jobs[0] 'a': exr_compression: no out of this format; leave it out" in solidgrain("bake", "--jobs", path).error
 
 
 def test_an_outputs_own_engine_turns_its_axes(solidgrain, write_jobs, tmp_path):
-    own = {"name": "a", "out": {"path": "a.atlas.png", "engine": "unity"}}
-    path = write_jobs(own, {"name": "b", "out": "b.atlas.png", "for": "unity"}, size=8)
+    own = [{"name": key, "out": {"path": f"{key}.atlas.png", key: "unity"}} for key in ("engine", "for")]
+    path = write_jobs(*own, {"name": "b", "out": "b.atlas.png", "for": "unity"}, size=8)
     assert solidgrain("bake", "--jobs", path, "--quiet").code == 0
-    axes = [json.loads((tmp_path / "show" / f"{name}.atlas.json").read_text())["axes"] for name in "ab"]
-    assert axes == ["+x-z+y"] * 2
+    axes = [json.loads((tmp_path / "show" / f"{name}.atlas.json").read_text())["axes"] for name in ("engine", "for", "b")]
+    assert axes == ["+x-z+y"] * 3
     path = write_jobs({"name": "a", "out": {"path": "a.dds", "engine": "unitee"}})
     assert "unknown engine; pick one of unreal, unity, godot" in solidgrain("bake", "--jobs", path).error
 
@@ -300,6 +305,19 @@ def test_textures_and_bundles_are_found_from_the_job_files_folder(
     assert solidgrain("bake", "--jobs", path).code == 0
     for name in "ab":
         assert np.array_equal(np.load(tmp_path / "show" / f"{name}.npy"), toy.grid((4, 5, 6)))
+
+
+def test_the_working_folder_does_not_say_which_texture_a_job_is_of(
+    solidgrain, write_jobs, toy, toy_folder, tmp_path, monkeypatch
+):
+    (tmp_path / "granite").symlink_to(toy_folder)
+    monkeypatch.chdir(tmp_path)
+    path = write_jobs({"name": "a", "out": "a.npy", "texture": "granite"})
+    assert solidgrain("bake", "--jobs", path).code == 0
+    assert np.array_equal(np.load(tmp_path / "show" / "a.npy"), load_texture(embedded_folder("granite")).grid((4, 5, 6)))
+    (tmp_path / "show" / "granite").symlink_to(toy_folder)
+    assert solidgrain("bake", "--jobs", path, "--overwrite").code == 0
+    assert np.array_equal(np.load(tmp_path / "show" / "a.npy"), toy.grid((4, 5, 6)))
 
 
 def test_flags_of_the_work_hold_for_all_jobs(solidgrain, write_jobs):

@@ -19,7 +19,7 @@ from solidgrain.bake import report as report_module
 from solidgrain.bake import staging as staging_module
 from solidgrain.bake.baker import bake, merge
 from solidgrain.bake.schema import load_plan
-from solidgrain.bake.staging import open_staging, staged_bytes, staging_folder
+from solidgrain.bake.staging import is_begun, open_staging, staged_bytes, staging_folder
 from solidgrain.bake.writers import PREVIEW, make_output
 from solidgrain.runtime import BakeError
 from tests.bake.test_command_bake import HEEDING
@@ -248,6 +248,23 @@ def test_replacing_files_can_be_resumed(solidgrain, tmp_path, toy, toy_folder):
     report = json.loads(solidgrain(*flags, "--resume", "--overwrite", "--json").out)
     assert report["reused_slices"] == 16
     assert np.array_equal(np.load(tmp_path / "a.npy"), toy.grid((40, 5, 6)))
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def test_what_another_plan_has_left_does_not_make_an_output_its_own(solidgrain, toy_folder, tmp_path, monkeypatch):
+    file = tmp_path / "a.npy"
+    assert solidgrain("bake", toy_folder, "--size", 4, "--out", file, "--quiet").code == 0
+    before = file.read_bytes()
+    with monkeypatch.context() as patch:  # stopped before the first file is in place
+        patch.setattr("solidgrain.bake.staging.Staging.commit", interrupt)
+        flags = ("--size", 4, "--seed", 2, "--resume", "--overwrite", "--quiet")
+        assert solidgrain("bake", toy_folder, *flags, "--out", file).code == 130
+    assert is_begun(file)
+    assert solidgrain("bake", toy_folder, "--size", 4, "--seed", 3, "--out", file, "--no-clobber", "--quiet").code == 0
+    assert file.read_bytes() == before
 
 
 def test_two_processes_cannot_write_the_same_output(toy, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 
 import numpy as np
@@ -29,6 +30,31 @@ def baked(tmp_path_factory, toy_folder):
     for name, flags in OUTPUTS.items():
         assert main([str(word) for word in ("bake", toy_folder, *FLAGS, "--out", folder / name, *flags, "--quiet")]) == 0
     return folder
+
+
+def test_what_lies_beside_the_files_goes_with_them_and_hides_nothing(solidgrain, toy, toy_folder, tmp_path):
+    folder = tmp_path / "made"
+    folder.mkdir()
+    (folder / "granite").write_text("a note")
+    shutil.copytree(toy_folder, folder / "bundle")
+    toy.save(folder / "mine.sgt.npz")
+    bakes = {
+        "a.npy": ("granite",),
+        "b.npy": (folder / "bundle",),
+        "c.npy": (folder / "mine.sgt.npz", "--bundle", folder / "bundle"),
+    }
+    for name, source in bakes.items():
+        assert solidgrain("bake", *source, "--size", 4, "--out", folder / ".." / "made" / name, "--quiet").code == 0
+    folder.rename(tmp_path / "moved")
+    for name in bakes:
+        outcome = solidgrain("verify", tmp_path / "moved" / name)
+        assert outcome.code == 0, outcome.err
+
+
+def test_a_stack_whose_name_is_not_utf_8_is_verified(solidgrain, toy_folder, tmp_path):
+    name = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.####.exr")
+    assert solidgrain("bake", toy_folder, "--size", 4, "--out", name, "--quiet").code == 0
+    assert solidgrain("verify", name, "--json").code == 0
 
 
 @pytest.fixture

@@ -100,6 +100,7 @@ def test_exr_attributes_say_what_a_slice_is(baked, toy):
     assert header["solidgrain:model"] == toy.data.sampler_sha256
     assert tuple(header["solidgrain:origin"]) == ORIGIN
     assert tuple(header["solidgrain:spacing"]) == SPACING
+    assert header["pixelAspectRatio"] == pytest.approx(SPACING[0] / SPACING[1])
 
 
 @pytest.mark.parametrize(("x", "y", "z"), VOXELS)
