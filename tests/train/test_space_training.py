@@ -71,10 +71,7 @@ def test_a_killed_space_resumes_to_the_same_numbers(tmp_path, monkeypatch):
     monkeypatch.setattr(preview, "SIZE", 32)
     folder = tmp_path / "killed"
     new_space(folder)
-    process = endless_training(folder)
-    deadline = time.monotonic() + 120
-    while not (folder / "checkpoint.pt").exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
+    process = endless_training(folder, until="checkpoint.pt")
     time.sleep(0.2)
     process.kill()
     process.communicate()

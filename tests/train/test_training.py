@@ -77,10 +77,14 @@ def assert_same_checkpoint(first, second):
     assert [name for name in a if not torch.equal(a[name], b[name])] == []
 
 
-def endless_training(folder):
-    """A run going on in a process of its own, for stopping."""
+def endless_training(folder, until):
+    """A run going on in a process of its own, for stopping, once it has written a file of that name."""
     flags = ["train", "--resume", str(folder), "--threads", "1", "--iterations", "10000"]
-    return subprocess.Popen([sys.executable, "-m", "solidgrain.bake.cli", *flags], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, "-m", "solidgrain.bake.cli", *flags], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not (folder / until).exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return process
 
 
 @pytest.fixture(scope="module")
@@ -175,10 +179,7 @@ def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, photograph):
     """Signal 9 in the middle, after the first checkpoint: statistics past it are rewound and written again."""
     folder = tmp_path / "killed"
     new_run(folder, photograph)
-    process = endless_training(folder)
-    deadline = time.monotonic() + 120
-    while not (folder / "checkpoint.pt").exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
+    process = endless_training(folder, until="checkpoint.pt")
     time.sleep(0.3)
     process.kill()
     process.communicate()
@@ -192,10 +193,7 @@ def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, photograph):
 def test_two_processes_cannot_train_the_same_run(tmp_path, photograph, solidgrain):
     folder = tmp_path / "run"
     new_run(folder, photograph)
-    process = endless_training(folder)
-    deadline = time.monotonic() + 120
-    while not (folder / "checkpoint.pt").exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
+    process = endless_training(folder, until="checkpoint.pt")
     for second in (("--resume", folder), (photograph, "--out", folder)):
         outcome = solidgrain("train", *second, "--iterations", 1, "--threads", 1)
         assert (outcome.code, outcome.err) == (
@@ -301,10 +299,7 @@ def test_a_diverging_run_says_so_and_keeps_its_last_checkpoint(tmp_path, photogr
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, photograph):
     folder = tmp_path / "run"
     new_run(folder, photograph)
-    process = endless_training(folder)
-    deadline = time.monotonic() + 120
-    while not (folder / "stats.jsonl").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    process = endless_training(folder, until="stats.jsonl")
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
