@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from types import FrameType, ModuleType
 from typing import NoReturn
 
-from solidgrain.bake.messages import tell_error
+from solidgrain.bake.messages import tell, tell_error
 
 COMMANDS = {
     "bake": ("solidgrain.bake.commands.bake", "evaluate a texture on a voxel grid and write it to files"),
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         resumes = any(word.startswith(("--resume", "--shard", "--dask")) for word in arguments)
         left = "go on with the same flags" if resumes else "nothing half-written was left behind"
-        print(f"interrupted; {left}", file=sys.stderr)
+        tell(f"interrupted; {left}")
         return INTERRUPTED
 
 
