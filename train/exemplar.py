@@ -48,6 +48,12 @@ def nonstationarity(exemplar: FloatArray) -> float:
     return float(blocks.mean((1, 3)).std() / max(float(grey.std()), 1e-6))
 
 
+def middle(exemplar: FloatArray, largest: int) -> FloatArray:
+    """What is in the middle of an exemplar [H, W, 3], of so many pixels along each side at most."""
+    top, left = (max(0, extent - largest) // 2 for extent in exemplar.shape[:2])
+    return exemplar[top : top + largest, left : left + largest]
+
+
 class Grain(NamedTuple):
     axis: Literal["x", "y"]  # the image axis along which structures are longer
     ratio: float  # their length across it over their length along it, at most 1
@@ -55,8 +61,7 @@ class Grain(NamedTuple):
 
 def measure_grain(exemplar: FloatArray) -> Grain:
     """The exemplar's grain, from the distances at which the autocorrelation of its middle falls to one half."""
-    top, left = (max(0, extent - CORRELATED) // 2 for extent in exemplar.shape[:2])
-    grey = exemplar[top : top + CORRELATED, left : left + CORRELATED].mean(-1)
+    grey = middle(exemplar, CORRELATED).mean(-1)
     grey = grey - grey.mean()
     spectrum = np.fft.rfft2(grey, s=[2 * extent for extent in grey.shape])  # zero-padded: no wrap-around
     correlation = np.fft.irfft2(np.abs(spectrum) ** 2)

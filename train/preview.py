@@ -12,7 +12,7 @@ from torch import Tensor
 
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.files import temporary_name
-from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.exemplar import FloatArray, middle
 from solidgrain.train.noise import draw_tables
 from solidgrain.train.settings import Settings
 from solidgrain.train.slices import flat_slice, from_quaternions
@@ -48,8 +48,7 @@ def write_preview(
     rows = []
     for exemplar, conditions in shown:
         pixels, panel = exemplar.permute(1, 2, 0).cpu().numpy(), np.zeros((SIZE, SIZE, 3), np.float32)
-        top, left = (max(extent - SIZE, 0) // 2 for extent in pixels.shape[:2])
-        crop = pixels[top : top + SIZE, left : left + SIZE]
+        crop = middle(pixels, SIZE)
         panel[: crop.shape[0], : crop.shape[1]] = crop
         rows.append(np.concatenate([panel, render_slices(model, settings, device, *conditions)], axis=1))
     _write_png(path, np.concatenate(rows))

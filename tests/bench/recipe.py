@@ -23,6 +23,7 @@ import torch
 from solidgrain.bake.arguments import parse_minutes, parse_positive
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.files import replacing
+from solidgrain.train import exemplar as exemplar_module
 from solidgrain.train.command import with_grain
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.photograph import read_exemplar
@@ -125,9 +126,7 @@ def middle(path: Path, largest: int) -> FloatArray:
     """An exemplar, or what is in the middle of it."""
     if not path.is_file():
         raise UsageError(f"--exemplar {path}: no such file; give photographs of at least {SMALLEST}x{SMALLEST} pixels")
-    pixels = read_exemplar(path, SMALLEST)
-    top, left = (max(0, extent - largest) // 2 for extent in pixels.shape[:2])
-    return np.ascontiguousarray(pixels[top : top + largest, left : left + largest])
+    return np.ascontiguousarray(exemplar_module.middle(read_exemplar(path, SMALLEST), largest))
 
 
 def finish_mark(
