@@ -49,7 +49,7 @@ def _put_in_place(hidden: Sequence[Path], files: Sequence[Path]) -> None:
     moved: list[tuple[Path, Path]] = []  # from where, to where
     try:
         for temporary, file in zip(hidden, files, strict=True):
-            former = file.with_name(f".{file.name}.{os.getpid()}.old")
+            former = temporary.with_suffix(".old")
             for source, target in ((file, former), (temporary, file)):
                 if source.exists():
                     os.replace(source, target)

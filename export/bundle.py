@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +32,7 @@ from solidgrain.runtime.bundle import (
     file_sha256,
 )
 from solidgrain.runtime.errors import BundleError
-from solidgrain.runtime.files import sync
+from solidgrain.runtime.files import sync, temporary_name
 from solidgrain.runtime.lattice import untiled
 from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.probe import probe_patch
@@ -99,8 +98,8 @@ def write_bundle(
     if folder.exists() and (strange := {path.name for path in folder.iterdir()} - parts):
         raise BundleError(f"{folder}: holds {', '.join(sorted(strange))}, which is no part of a bundle; move it away first")
     folder = folder.resolve()
-    building = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    former = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+    building = temporary_name(folder)
+    former = building.with_suffix(".old")
     try:
         building.mkdir(parents=True)
         _fill(building, content, details)
