@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from solidgrain.bake.plan import Plan
     from solidgrain.bake.writers import Output
     from solidgrain.runtime import Texture
+
+# Flags that are about every --out, and the names of their values.
+SHARED = {"--colorspace": "colorspace", "--dither": "dither", "--mips": "mips", "--mip-filter": "mip_filter", "--for": "engine"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -168,18 +172,23 @@ def make_outputs(arguments: argparse.Namespace) -> list[Output]:
     return outputs
 
 
-def _check_uses(arguments: argparse.Namespace) -> None:
-    """Refuse flags that are about no output. Raises UsageError."""
+def unused(paths: Iterable[Path]) -> dict[str, str]:
+    """The flags that none of these outputs has a use for, each with the reason."""
     from solidgrain.bake.writers import formats, kind_of
 
-    written = {formats()[kind_of(path)].name for path in arguments.out}
-    for row in formats().values():
-        for option in row.options:
-            if row.name not in written and getattr(arguments, f"{row.name}_{option.name}".replace("-", "_")) is not None:
-                raise UsageError(f"--{row.name}-{option.name}: no --out of this format; leave it out")
-    for name, flag in (("mips", "--mips"), ("colorspace", "--colorspace"), ("engine", "--for"), ("dither", "--dither")):
-        if not written and getattr(arguments, name):
-            raise UsageError(f"{flag}: the preview has no use for it, and there is no --out; leave it out")
+    written = {formats()[kind_of(path)].name for path in paths}
+    others = [row for row in formats().values() if row.name not in written]
+    found = {f"--{row.name}-{option.name}": "no --out of this format" for row in others for option in row.options}
+    if not written:
+        found |= dict.fromkeys(SHARED, "the preview has no use for it, and there is no --out")
+    return found
+
+
+def _check_uses(arguments: argparse.Namespace) -> None:
+    """Refuse flags that are about no output. Raises UsageError."""
+    for flag, reason in unused(arguments.out).items():
+        if getattr(arguments, SHARED.get(flag, flag[2:].replace("-", "_"))) not in (None, False):
+            raise UsageError(f"{flag}: {reason}; leave it out")
     if arguments.colorspace == "":
         raise UsageError("--colorspace: expected a name, found nothing")
 

@@ -95,15 +95,11 @@ def read_jobs(path: Path, work: argparse.Namespace) -> list[Job]:
 
 def _of_use(defaults: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     """The defaults that a job has a use for: not the settings of formats that it does not write."""
-    from solidgrain.bake.writers import formats, kind_of
+    from solidgrain.bake.flags import unused
 
-    paths = [Path(output["path"]) for output in _outputs({**defaults, **own})]
-    written = {formats()[kind_of(path)].name for path in paths}
-    others = (row for row in formats().values() if row.name not in written)
-    unused = {f"{row.name}_{option.name}".replace("-", "_") for row in others for option in row.options}
-    if not paths:
-        unused |= {"mips", "mip_filter", "colorspace", "dither", "for"}  # a preview has none of these
-    return {key: value for key, value in defaults.items() if key not in unused}
+    outputs = _outputs({**defaults, **own})
+    idle = {flag[2:].replace("-", "_") for flag in unused(Path(output["path"]) for output in outputs)}
+    return {key: value for key, value in defaults.items() if key not in idle}
 
 
 def _outputs(values: dict[str, Any]) -> list[dict[str, Any]]:

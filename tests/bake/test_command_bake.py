@@ -93,6 +93,7 @@ USAGE = (
     "a.vti: two outputs",
     "a.01.exr: two outputs",
     "ends in .png",
+    "no use for it",
     "nothing to write",
     "expected at most",
 )
@@ -106,6 +107,8 @@ USAGE = (
         (["--out", "a.vti", "--out", "./a.vti"], "a.vti: two outputs"),
         (["--out", "a.##.exr", "--out", "a.%02d.exr", "--size", "4"], "a.01.exr: two outputs"),
         (["--preview", "a.jpg"], "ends in .png"),
+        (["--preview", "a.png", "--dither"], "no use for it"),
+        (["--preview", "a.png", "--mip-filter", "box"], "no use for it"),
         (["--out", "missing/a.vti"], "does not exist"),
         (["--out", "a.vti", "--size", "1000x1000x10000000"], "free"),
         (["--out", "a.vti", "--size", "2000000x2000000x1"], "memory"),
