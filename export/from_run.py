@@ -13,9 +13,9 @@ from solidgrain.export.bundle import Details, DoubleArray, FloatArray, SamplerWe
 from solidgrain.export.card import write_card
 from solidgrain.export.sampler_graph import build_sampler_graph
 from solidgrain.runtime.errors import TrainingError
-from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.colors import settle_mean
+from solidgrain.train.noise import runtime_noise
 from solidgrain.train.run import Run, RunFolder, open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import to_json
@@ -99,10 +99,9 @@ def check_agreement(sampler: Sampler, weights: SamplerWeights) -> float:
     octaves = len(weights.transforms)
     texture = TextureData("", "", weights.transforms, weights.gamma, weights.delta, weights.noise_weights)
     model = build_sampler_graph(weights.weights, weights.biases, octaves)
-    exact, tables = copy.deepcopy(sampler).double(), torch.from_numpy(noise_tables(SEED, octaves)).double()
-    points = random_points(SEED)
-    exact.offsets = torch.from_numpy(noise_offsets(SEED, octaves))
-    expected = exact(tables, torch.from_numpy(points / UNIT)[None])[0].numpy()
+    exact, points = copy.deepcopy(sampler).double(), random_points(SEED)
+    where = torch.from_numpy(points / UNIT)[None]
+    expected = exact(runtime_noise(SEED, octaves, where), where)[0].numpy()
     worst = float(np.abs(run_graph(model, texture, points, SEED) - expected).max())
     if not worst <= TOLERANCE:
         raise TrainingError(f"torch and ONNX Runtime differ by {worst:.2g} in colour, expected at most {TOLERANCE:g}")

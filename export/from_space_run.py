@@ -24,9 +24,9 @@ from solidgrain.export.space_graphs import (
 )
 from solidgrain.runtime.bundle import CRITIC, SAMPLER, file_sha256
 from solidgrain.runtime.errors import TrainingError
-from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.probe import probe_patch
 from solidgrain.train.layers import Conv, Linear
+from solidgrain.train.noise import runtime_noise
 from solidgrain.train.run import pixels_sha256
 from solidgrain.train.sampler import Condition, Sampler
 from solidgrain.train.settings import to_json
@@ -131,10 +131,9 @@ def check_space_agreement(space: Space, weights: SpaceWeights) -> dict[str, floa
     )
     octaves = len(textures[0].transforms)
     sampler, points = build_sampler_graph(weights.weights, weights.biases, octaves), random_points(SEED)
-    tables, exact.sampler.offsets = _double(noise_tables(SEED, octaves)), _double(noise_offsets(SEED, octaves))
-    one = textures[0]
+    one, where = textures[0], _double(points)[None] / UNIT
     condition = Condition(_double(one.transforms)[None] * UNIT, _double(one.gamma)[None], _double(one.delta)[None])
-    rgb = exact.sampler(tables, _double(points)[None] / UNIT, condition)[0]
+    rgb = exact.sampler(runtime_noise(SEED, octaves, where), where, condition)[0]
     differences["sampler.onnx"] = _largest(run_graph(sampler, one, points, SEED), rgb)
     for graph, difference in differences.items():
         if not difference <= TOLERANCE:

@@ -29,7 +29,7 @@ from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
 from solidgrain.train.loop import use_bfloat16
 from solidgrain.train.losses import gram_difference, mean_gram, mean_grams
-from solidgrain.train.noise import draw_tables, look_up
+from solidgrain.train.noise import Noise, draw_noise, look_up
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, draw_slices
 from solidgrain.train.vgg import Vgg
@@ -49,7 +49,7 @@ class Recipe:
     warm_up: int = 10  # iterations until rates are whole: Adam's first steps are as long as its others, in no sure direction
     constant: float = 2 / 3  # share of the budget after which rates begin to fall, to a tenth
     average_decay: float = 0.98  # of the moving average that becomes the texture
-    tables_kept: int = 8  # iterations that share noise tables, each with offsets of its own
+    noise_kept: int = 8  # iterations that share noise tables, each with offsets of its own
     crops: int = 128  # of the photograph, whose mean Gram matrices are aimed at
     measured: int = 8  # batches, of L_style as it is reported
     memory: int = 30  # iterations, of the running mean of L_style
@@ -175,13 +175,12 @@ class Adaptation:
         self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
         self.stretch = stretch_to(features.contrast, photograph, device)
         self.target = self._mean_grams(photograph)
-        self.tables = torch.empty(0)
 
     def step(self, pace: float) -> float:
         """One iteration at so much of the rates. L_style before it."""
-        if self.iteration % self.recipe.tables_kept == 0:
-            self.tables = draw_tables(self.settings.octaves, self.settings.resolution, self.generator)
-        loss = self._style(self.theta, self.tables, self.generator)
+        if self.iteration % self.recipe.noise_kept == 0:
+            self.noise = draw_noise(self.settings.octaves, self.settings.resolution, self.generator)
+        loss = self._style(self.theta, self.noise, self.generator)
         self.optimiser.zero_grad()
         torch.autograd.backward(loss)
         pace *= min((self.iteration + 1) / self.recipe.warm_up, 1.0)
@@ -192,14 +191,13 @@ class Adaptation:
         self.iteration += 1
         return float(loss.detach())
 
-    def _style(self, theta: Theta, tables: Tensor, generator: torch.Generator) -> Tensor:
+    def _style(self, theta: Theta, noise: Noise, generator: torch.Generator) -> Tensor:
         """L_style of random slices."""
         settings = self.settings
         points = draw_slices(settings, generator)
-        offsets = settings.resolution * torch.rand(settings.octaves, 3, generator=generator, device=generator.device)
-        noise = look_up(tables, theta.directions * self.octave_scale, points, offsets)
+        eta = look_up(noise.moved(generator), theta.directions * self.octave_scale, points)
         with self._autocast():  # coordinates stay outside it: in bfloat16 they are wrong by texels
-            rgb = self.sampler(noise, theta)
+            rgb = self.sampler(eta, theta)
             images = rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
             activations = self.features.activations(self.stretch(images))
         pairs = zip(self.target, activations, strict=True)
@@ -228,8 +226,8 @@ class Adaptation:
     def measure(self, theta: Theta) -> float:
         """L_style over many slices, the same ones whenever it is called."""
         generator = torch.Generator(self.generator.device).manual_seed((self.settings.seed + 1) % 2**64)
-        tables = draw_tables(self.settings.octaves, self.settings.resolution, generator)
-        return float(torch.stack([self._style(theta, tables, generator) for _ in range(self.recipe.measured)]).mean())
+        noise = draw_noise(self.settings.octaves, self.settings.resolution, generator)
+        return float(torch.stack([self._style(theta, noise, generator) for _ in range(self.recipe.measured)]).mean())
 
     def texture(self, theta: Theta) -> TextureData:
         directions, gamma, delta, noise_weights = (part.detach().cpu().numpy() for part in theta)

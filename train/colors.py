@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from solidgrain.train.exemplar import FloatArray
-from solidgrain.train.noise import draw_tables
+from solidgrain.train.noise import draw_noise
 from solidgrain.train.sampler import NARROWEST, NoiseAtInputSampler, Sampler
 from solidgrain.train.slices import scatter
 
@@ -63,8 +63,8 @@ def colors_of(sampler: Sampler | NoiseAtInputSampler) -> Tensor:
     generator = torch.Generator(sampler.directions.device).manual_seed(7)
     colors = []
     for _ in range(INSTANCES):
-        tables = draw_tables(len(sampler.directions), RESOLUTION, generator)
-        colors.append(sampler(tables, scatter(1, PLACES, generator))[0].double())
+        noise = draw_noise(len(sampler.directions), RESOLUTION, generator)
+        colors.append(sampler(noise, scatter(1, PLACES, generator))[0].double())
     return torch.cat(colors).cpu()
 
 

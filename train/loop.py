@@ -21,7 +21,7 @@ from solidgrain.train.preview import write_preview
 from solidgrain.train.processes import Processes
 from solidgrain.train.run import CHECKPOINT, PARTS, Run, RunFolder
 from solidgrain.train.settings import Budget, Settings, rate
-from solidgrain.train.task import Batch, Colors, make_task
+from solidgrain.train.task import Batch, Colors, Inputs, make_task
 from solidgrain.train.watch import SETTLING, Watch, flaw
 
 ALONE = Processes()
@@ -123,7 +123,7 @@ class Trainer:
         """The batch's slices, as images."""
         return self._synthesise(batch.inputs).reshape(-1, *batch.real.shape[2:], 3).permute(0, 3, 1, 2)
 
-    def _synthesise(self, inputs: tuple[Tensor, ...]) -> Tensor:
+    def _synthesise(self, inputs: Inputs) -> Tensor:
         """The model's colours [B, P, 3]."""
         with self._autocast():  # the points are made outside it: in bfloat16 they are off by a tenth of a pixel
             rgb: Tensor = self.sampler(*inputs)

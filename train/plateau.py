@@ -21,7 +21,7 @@ from solidgrain.train.companion import embedded_critic
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.losses import gram_difference, mean_grams
-from solidgrain.train.noise import draw_tables
+from solidgrain.train.noise import draw_noise
 from solidgrain.train.settings import FAST, Settings
 from solidgrain.train.slices import draw_slices
 
@@ -78,8 +78,8 @@ class Onlooker:
         """The mean over layers of the relative difference of Gram matrices."""
         settings, generator, images = self.settings, self._stream(), []
         for _ in range(BATCHES):
-            tables = draw_tables(settings.octaves, settings.resolution, generator)
-            rgb = average(tables, draw_slices(settings, generator))
+            noise = draw_noise(settings.octaves, settings.resolution, generator)
+            rgb = average(noise, draw_slices(settings, generator))
             images.append(rgb.reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2))
         pairs = zip(self.wanted, self._mean_grams(images), strict=True)
         return float(torch.stack([gram_difference(wanted, found, relative=True) for wanted, found in pairs]).mean())

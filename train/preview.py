@@ -13,11 +13,11 @@ from torch import Tensor
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.files import temporary_name
 from solidgrain.train.exemplar import FloatArray, middle
-from solidgrain.train.noise import draw_tables
+from solidgrain.train.noise import draw_noise
 from solidgrain.train.settings import Settings
 from solidgrain.train.slices import flat_slice, from_quaternions
 
-Model = Callable[..., Tensor]  # tables, points and what else it needs -> colours
+Model = Callable[..., Tensor]  # noise, points and what else it needs -> colours
 
 SIZE = 256  # pixels along each side of a slice
 
@@ -29,10 +29,10 @@ def render_slices(model: Model, settings: Settings, device: torch.device, *condi
     The noise is the same every time, so that a folder of samples shows the training and nothing else.
     """
     generator = torch.Generator(device).manual_seed(7)
-    tables = draw_tables(settings.octaves, settings.resolution, generator)
+    noise = draw_noise(settings.octaves, settings.resolution, generator)
     oblique = from_quaternions(torch.tensor([[0.5, 0.1, 0.7, 0.5]], device=device))[0]
     flat = flat_slice(SIZE, device)
-    slices = [model(tables, points[None], *conditions).reshape(SIZE, SIZE, 3) for points in (flat, flat @ oblique.T)]
+    slices = [model(noise, points[None], *conditions).reshape(SIZE, SIZE, 3) for points in (flat, flat @ oblique.T)]
     image: FloatArray = torch.cat(slices, 1).clamp(0, 1).cpu().numpy()
     return image
 

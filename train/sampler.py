@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from solidgrain.train.layers import Linear, activate
-from solidgrain.train.noise import look_up
+from solidgrain.train.noise import Noise, look_up
 from solidgrain.train.settings import Settings
 
 HIDDEN_LAYERS = 5
@@ -43,7 +43,6 @@ class Octaves(nn.Module):
         self.register_load_state_dict_pre_hook(_keep_own_colors)  # type: ignore[no-untyped-call]
         self.directions = nn.Parameter(_start_directions(settings, generator))  # [n, 3, 3]
         self.register_buffer("octave_scale", _octave_scale(settings).to(generator.device))  # [n, 1, 3]
-        self.offsets: Tensor | None = None  # [n, 3] texels; training shifts its slices at random instead
 
     def transforms(self) -> Tensor:
         """T_i [n, 3, 3], on coordinates in units of 64 pixels."""
@@ -72,9 +71,9 @@ class Octaves(nn.Module):
             rgb: Tensor = self.color_mean.to(exact) + output(exact) @ self.color_axes.to(exact)
         return rgb
 
-    def noise(self, tables: Tensor, points: Tensor, transforms: Tensor | None = None) -> Tensor:
-        """eta(c): tables [n, R, R, R], points [B, P, 3] -> [B, P, n], through `transforms` in place of its own if given."""
-        return look_up(tables, self.transforms() if transforms is None else transforms, points, self.offsets)
+    def eta(self, noise: Noise, points: Tensor, transforms: Tensor | None = None) -> Tensor:
+        """eta(c): points [B, P, 3] -> [B, P, n], through `transforms` in place of its own if given."""
+        return look_up(noise, self.transforms() if transforms is None else transforms, points)
 
 
 class Sampler(Octaves):
@@ -90,13 +89,13 @@ class Sampler(Octaves):
         self.noise_weights = nn.Parameter(settings.noise_weight_start * noise_weights)  # A of Eq. 2, transposed
         self.output = Linear(m, 3, generator, gain=1.0)
 
-    def forward(self, tables: Tensor, points: Tensor, condition: Condition | None = None) -> Tensor:
-        """Colour at points: tables [n, R, R, R], points [B, P, 3] -> rgb [B, P, 3], not clipped to [0, 1].
+    def forward(self, noise: Noise, points: Tensor, condition: Condition | None = None) -> Tensor:
+        """Colour at points [B, P, 3] -> rgb [B, P, 3], not clipped to [0, 1].
 
         Without a condition it is its own texture: its own T_i, no scale and no shift.
         """
-        noise = self.noise(tables, points, condition and condition.transforms)
-        bins = noise.chunk(BINS, dim=-1)  # (B, P, n / 4) each
+        eta = self.eta(noise, points, condition and condition.transforms)
+        bins = eta.chunk(BINS, dim=-1)  # (B, P, n / 4) each
         x: Tensor = self.constant
         for layer, dense in enumerate(self.hidden):
             y: Tensor = dense(x)
@@ -117,9 +116,9 @@ class NoiseAtInputSampler(Octaves):
         self.hidden = nn.ModuleList(Linear(n if layer == 0 else m, m, generator) for layer in range(HIDDEN_LAYERS))
         self.output = Linear(m, 3, generator, gain=1.0)
 
-    def forward(self, tables: Tensor, points: Tensor, condition: Condition | None = None) -> Tensor:
+    def forward(self, noise: Noise, points: Tensor, condition: Condition | None = None) -> Tensor:
         """As `Sampler.forward`."""
-        x = self.noise(tables, points, condition and condition.transforms)
+        x = self.eta(noise, points, condition and condition.transforms)
         for layer, dense in enumerate(self.hidden):
             x = activate(dense(x))
             if condition is not None:

@@ -29,7 +29,7 @@ class Settings:
     orthogonal_start: bool = True  # T_i starts as a random orthogonal matrix, else N(0,1)^{3x3}
     noise_weight_start: float = 0.5  # standard deviation of A at the start
     principal_colors: bool = False  # the output is along the principal axes of the exemplar's colours, else red, green, blue
-    shared_noise: bool = False  # one set of noise tables, moved around at random in each iteration, else fresh ones
+    shared_noise: bool = False  # one set of noise tables, read elsewhere in each iteration, else fresh ones
     noise_at_input: bool = False  # all octaves enter S at its input (Fig. 2 a), none its hidden layers
 
     # Slices (Sec. 4, implementation details)

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from solidgrain.train.encoder import MOMENTS, Encoder
 from solidgrain.train.layers import Linear, activate
+from solidgrain.train.noise import Noise
 from solidgrain.train.sampler import HIDDEN_LAYERS, Condition, make_sampler
 from solidgrain.train.settings import Settings
 
@@ -69,9 +70,9 @@ class Space(nn.Module):
             torch.cat([delta[:, :-1], last_delta[:, None]], 1),
         )
 
-    def forward(self, tables: Tensor, points: Tensor, patches: Tensor) -> Tensor:
+    def forward(self, noise: Noise, points: Tensor, patches: Tensor) -> Tensor:
         """Colour [B, P, 3] at points [B, P, 3] of the textures of patches [B, 3, 128, 128]."""
-        rgb: Tensor = self.sampler(tables, points, self.condition(self.encoder(patches)))
+        rgb: Tensor = self.sampler(noise, points, self.condition(self.encoder(patches)))
         return rgb
 
 

@@ -15,7 +15,7 @@ from solidgrain.train import collection, exemplar
 from solidgrain.train.collection import Member
 from solidgrain.train.contrast import Stretch, stretch_to, together, unstretched
 from solidgrain.train.first_sampler import begin_as
-from solidgrain.train.noise import draw_tables, shift_tables
+from solidgrain.train.noise import Noise, draw_noise
 from solidgrain.train.run import Run, RunFolder
 from solidgrain.train.sampler import Sampler, make_sampler
 from solidgrain.train.settings import Settings
@@ -27,18 +27,20 @@ PLACES = 4096  # at which an average is looked at
 COLOR_PLACES = 1024  # places whose colours are compared: costlier than in a slice, for no two share a texel
 SHOWN = 4  # exemplars of a space in a sample, half of them held out
 
+Inputs = tuple[Noise, *tuple[Tensor, ...]]  # of a model: noise, points [B, P, 3], and for a space the patches that E sees
+
 
 class Colors(NamedTuple):
     """Colours from all over the solid, and from all over its exemplar."""
 
-    inputs: tuple[Tensor, ...]  # what the model is called with for P of them
+    inputs: Inputs
     wanted: Tensor  # [P, 3]
 
 
 class Batch(NamedTuple):
-    """What the model is called with, and what its slices are compared with."""
+    """Slices for the model to make, P = patch², and what they are compared with."""
 
-    inputs: tuple[Tensor, ...]  # noise tables, points [B, patch², 3], and for a space the patches that E sees
+    inputs: Inputs
     real: Tensor  # [B, 3, patch, patch]
     stretch: Stretch  # what D sees of either
     colors: Colors | None = None  # where L_color compares them
@@ -47,7 +49,7 @@ class Batch(NamedTuple):
 class Probe(NamedTuple):
     """A fixed question to a model, and the exemplars [3, H, W] whose colours its answers [K, P, 3] should have."""
 
-    inputs: tuple[Tensor, ...]
+    inputs: Inputs
     exemplars: Sequence[Tensor]
 
 
@@ -62,7 +64,7 @@ class Task(Protocol):
     def probe(self) -> Probe: ...
 
     def shown(self) -> Sequence[tuple[Tensor, tuple[Tensor, ...]]]:
-        """What a sample shows: exemplars [3, H, W], with what the model needs besides tables and points for each."""
+        """What a sample shows: exemplars [3, H, W], with what the model needs besides noise and points for each."""
 
 
 def make_task(run: RunFolder, device: torch.device) -> Task:
@@ -72,20 +74,19 @@ def make_task(run: RunFolder, device: torch.device) -> Task:
     return SingleExemplar(run, device)
 
 
-class Noise:
-    """Where a batch's noise instance comes from; its slices share one."""
+class Instances:
+    """Where a batch's noise comes from; its slices share an instance."""
 
     def __init__(self, settings: Settings, device: torch.device) -> None:
-        self.settings, self.shared = settings, torch.empty(0)
-        if settings.shared_noise:
-            self.shared = self._fresh(torch.Generator(device).manual_seed((settings.seed + 1) % 2**64))
+        self.settings = settings
+        own = torch.Generator(device).manual_seed((settings.seed + 1) % 2**64)
+        self.shared = self._fresh(own) if settings.shared_noise else None
 
-    def draw(self, generator: torch.Generator) -> Tensor:
-        """Tables [n, R, R, R]."""
-        return shift_tables(self.shared, generator) if self.settings.shared_noise else self._fresh(generator)
+    def draw(self, generator: torch.Generator) -> Noise:
+        return self._fresh(generator) if self.shared is None else self.shared.moved(generator)
 
-    def _fresh(self, generator: torch.Generator) -> Tensor:
-        return draw_tables(self.settings.octaves, self.settings.resolution, generator)
+    def _fresh(self, generator: torch.Generator) -> Noise:
+        return draw_noise(self.settings.octaves, self.settings.resolution, generator)
 
 
 class SingleExemplar:
@@ -95,7 +96,7 @@ class SingleExemplar:
         self.run, self.settings, self.device = run, run.settings, device
         self.exemplar = torch.from_numpy(run.exemplar).permute(2, 0, 1).to(device)  # (3, H, W)
         self.stretch = stretch_to(run.settings.critic_contrast, run.exemplar, device)
-        self.noise = Noise(run.settings, device)
+        self.instances = Instances(run.settings, device)
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
         sampler = make_sampler(self.settings, generator)
@@ -111,16 +112,16 @@ class SingleExemplar:
 
     def draw(self, iteration: int, generator: torch.Generator) -> Batch:
         settings = self.run.settings_at(iteration)
-        tables, points = self.noise.draw(generator), draw_slices(settings, generator)
+        noise, points = self.instances.draw(generator), draw_slices(settings, generator)
         real = exemplar.draw_patches(self.exemplar, settings, generator)
-        colors = self._draw_colors(tables, generator) if settings.color_weight else None
-        return Batch((tables, points), real, self.stretch, colors)
+        colors = self._draw_colors(noise, generator) if settings.color_weight else None
+        return Batch((noise, points), real, self.stretch, colors)
 
-    def _draw_colors(self, tables: Tensor, generator: torch.Generator) -> Colors:
+    def _draw_colors(self, noise: Noise, generator: torch.Generator) -> Colors:
         """At scattered places, for those of a few slices depend on each other."""
         pixels = self.exemplar.flatten(1).T
         chosen = torch.randint(len(pixels), (COLOR_PLACES,), generator=generator, device=self.device)
-        return Colors((tables, scatter(1, COLOR_PLACES, generator)), pixels[chosen])
+        return Colors((noise, scatter(1, COLOR_PLACES, generator)), pixels[chosen])
 
     def probe(self) -> Probe:
         return Probe(_probe_inputs(self.settings, 1, self.device), [self.exemplar])
@@ -139,7 +140,7 @@ class TextureSpace:
         self.stretches = [
             stretch_to(contrast, one.exemplar, device) if contrast else unstretched(device) for one in self.members
         ]
-        self.noise = Noise(run.settings, device)
+        self.instances = Instances(run.settings, device)
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
         return Space(self.settings, generator)
@@ -153,14 +154,14 @@ class TextureSpace:
 
     def draw(self, iteration: int, generator: torch.Generator) -> Batch:
         settings, device = self.settings, self.device
-        tables, points = self.noise.draw(generator), draw_slices(settings, generator)
+        noise, points = self.instances.draw(generator), draw_slices(settings, generator)
         order = torch.randperm(len(self.members), generator=generator, device=device).tolist()
         places = [order[k % len(order)] for k in range(settings.batch)]
         chosen = [self.members[place] for place in places]
         seen = [collection.draw_patches(one, settings.encoded_patch, 1, settings, generator) for one in chosen]
         real = [collection.draw_patches(one, settings.patch, 1, settings, generator) for one in chosen]
         stretch = together([self.stretches[place] for place in places])
-        return Batch((tables, points, torch.cat(seen)), torch.cat(real).contiguous(memory_format=torch.channels_last), stretch)
+        return Batch((noise, points, torch.cat(seen)), torch.cat(real).contiguous(memory_format=torch.channels_last), stretch)
 
     def probe(self) -> Probe:
         generator = torch.Generator(self.device).manual_seed(7)
@@ -181,8 +182,8 @@ def _spread(members: Sequence[Member], count: int) -> list[Member]:
     return [members[k * len(members) // count] for k in range(count)]
 
 
-def _probe_inputs(settings: Settings, images: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def _probe_inputs(settings: Settings, images: int, device: torch.device) -> tuple[Noise, Tensor]:
     """One instance at far-apart places, which are as independent as instances."""
     generator = torch.Generator(device).manual_seed(7)
-    tables = draw_tables(settings.octaves, settings.resolution, generator)
-    return tables, scatter(images, PLACES, generator)
+    noise = draw_noise(settings.octaves, settings.resolution, generator)
+    return noise, scatter(images, PLACES, generator)

@@ -23,17 +23,16 @@ from torch import Tensor
 from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive
 from solidgrain.runtime.errors import SolidgrainError, TrainingError, UsageError
 from solidgrain.runtime.files import replacing
-from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.provider import usable_threads
 from solidgrain.train.colors import settle_mean
 from solidgrain.train.cuts import Sample
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
 from solidgrain.train.loop import train
+from solidgrain.train.noise import Noise, runtime_noise
 from solidgrain.train.run import Run, RunFolder, Source, create_run, open_run
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, flat_slice
-from solidgrain.train.space import Space
 from solidgrain.train.task import make_task
 from solidgrain.train.vgg import find_weights
 
@@ -167,18 +166,15 @@ class Opened:
         to the origin first, where float32 coordinates are exact enough: a texture is the same everywhere.
         """
         model, device = self.model, self.device
-        sampler = model.sampler if isinstance(model, Space) else model
-        instance: dict[int, tuple[Tensor, Tensor]] = {}
+        instance: dict[int, Noise] = {}
 
         @torch.no_grad()
         def sample(points: np.ndarray[Any, np.dtype[np.float64]], seed: int) -> FloatArray:
+            near = torch.from_numpy((points - points.mean(0)) / UNIT).float().to(device)
             if seed not in instance:
                 instance.clear()
-                noise = noise_tables(seed, self.octaves), noise_offsets(seed, self.octaves).astype(np.float32)
-                instance[seed] = torch.from_numpy(noise[0]).to(device), torch.from_numpy(noise[1]).to(device)
-            tables, sampler.offsets = instance[seed]
-            near = torch.from_numpy((points - points.mean(0)) / UNIT).float().to(device)
-            rgb = torch.cat([model(tables, chunk[None], *conditions)[0] for chunk in torch.split(near, CHUNK)])
+                instance[seed] = runtime_noise(seed, self.octaves, near)
+            rgb = torch.cat([model(instance[seed], chunk[None], *conditions)[0] for chunk in torch.split(near, CHUNK)])
             found: FloatArray = rgb.clamp(0, 1).cpu().numpy()
             return found
 

@@ -105,15 +105,16 @@ def torch_rate(octaves: int, threads: int, points: int = 2**16) -> float:
 
     import torch
 
+    from solidgrain.train.noise import runtime_noise
     from solidgrain.train.sampler import Sampler
     from solidgrain.train.settings import FAST
 
     torch.set_num_threads(threads)
     sampler = Sampler(replace(FAST, octaves=octaves), torch.Generator().manual_seed(0))
-    tables = torch.from_numpy(noise_tables(0, octaves))
     where = torch.from_numpy(slice_points(points) / 64).float()[None]
+    noise = runtime_noise(0, octaves, where)
     with torch.no_grad():
-        return points / fastest(lambda: sampler(tables, where))
+        return points / fastest(lambda: sampler(noise, where))
 
 
 def torch_rate_without_avx512(octaves: int, threads: int) -> float:

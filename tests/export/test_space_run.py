@@ -8,8 +8,8 @@ import torch
 
 from solidgrain.export.from_space_run import export_space_run
 from solidgrain.runtime import TrainingError, load_space
-from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.train.loop import Trainer
+from solidgrain.train.noise import runtime_noise
 from solidgrain.train.slices import UNIT
 from tests.train.spaces import new_space, photographs
 from tests.train.test_training import CPU
@@ -26,9 +26,8 @@ def test_a_bundle_shows_what_the_run_shows(tmp_path, changes):
     texture = load_space(export_space_run(run.folder, tmp_path / "bundle")).encode(patch)
     points = np.random.default_rng(2).uniform(0, 200, (500, 3))
     average, octaves = trainer.average, run.settings.octaves
-    average.sampler.offsets = torch.from_numpy(noise_offsets(5, octaves)).float()
-    inputs = torch.from_numpy(noise_tables(5, octaves)), torch.from_numpy(points / UNIT).float()[None]
-    expected = average(*inputs, torch.from_numpy(patch.copy()).permute(2, 0, 1)[None])[0].clamp(0, 1).numpy()
+    where, seen = torch.from_numpy(points / UNIT).float()[None], torch.from_numpy(patch.copy()).permute(2, 0, 1)[None]
+    expected = average(runtime_noise(5, octaves, where), where, seen)[0].clamp(0, 1).numpy()
     assert expected.std() > 0.02
     assert np.abs(texture.sample(points, 5) - expected).max() < 0.02  # the encoder's weights are halves in the bundle
 

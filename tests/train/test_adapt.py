@@ -17,7 +17,6 @@ import torch
 from solidgrain.export.from_space_run import export_space_run
 from solidgrain.runtime import BundleError, ExemplarError, TrainingError, load_space, load_texture
 from solidgrain.runtime.bundle import CRITIC, open_bundle
-from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.train import adapt as adapt_module
 from solidgrain.train.adapt import (
     DEFAULT,
@@ -33,7 +32,7 @@ from solidgrain.train.adapt_command import make_budget
 from solidgrain.train.companion import read_companion
 from solidgrain.train.console import StopRequest
 from solidgrain.train.loop import Trainer
-from solidgrain.train.noise import look_up
+from solidgrain.train.noise import look_up, runtime_noise
 from solidgrain.train.settings import Budget
 from solidgrain.train.slices import UNIT
 from tests.toy_space import write_toy_critic
@@ -157,11 +156,10 @@ def test_the_rebuilt_sampler_says_what_the_runtime_says(space, clouds):
     moved = {name: getattr(start, name) * draw.uniform(0.8, 1.2, getattr(start, name).shape) for name in ARRAYS}
     texture = replace(start, **{name: value.astype(getattr(start, name).dtype) for name, value in moved.items()})
     points, octaves = draw.uniform(-64, 64, (4096, 3)), len(texture.transforms)
-    tables, offsets = torch.from_numpy(noise_tables(3, octaves)), torch.from_numpy(noise_offsets(3, octaves))
-    transforms = torch.from_numpy(texture.transforms)
-    noise = look_up(tables.double(), transforms, torch.from_numpy(points)[None], offsets.double())
+    transforms, where = torch.from_numpy(texture.transforms), torch.from_numpy(points)[None]
+    eta = look_up(runtime_noise(3, octaves, where), transforms, where)
     theta = Theta(torch.empty(0), *(torch.from_numpy(getattr(texture, name)) for name in ARRAYS[1:]))
-    rgb = FrozenSampler(space.bundle, texture, CPU)(noise.float(), theta)[0].numpy()
+    rgb = FrozenSampler(space.bundle, texture, CPU)(eta.float(), theta)[0].numpy()
     np.testing.assert_allclose(rgb.clip(0, 1), space.open(texture).sample(points, seed=3), atol=1e-4)
 
 

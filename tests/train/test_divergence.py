@@ -11,7 +11,7 @@ import torch
 from solidgrain.runtime import TrainingError
 from solidgrain.train import critic, loop, settings, watch
 from solidgrain.train.loop import Trainer, train
-from solidgrain.train.noise import draw_tables
+from solidgrain.train.noise import draw_noise
 from solidgrain.train.run import open_run
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import PRESETS, Budget, preset
@@ -250,10 +250,10 @@ def test_a_slow_explosion_is_noticed_too():
 def test_fresh_networks_have_no_flaw_whatever_the_preset(name):
     draw = torch.Generator().manual_seed(0)
     settings = preset(name)
-    tables, points = draw_tables(settings.octaves, 64, draw), 64 * torch.rand(2, 500, 3, generator=draw)
+    noise, points = draw_noise(settings.octaves, 64, draw), 64 * torch.rand(2, 500, 3, generator=draw)
     exemplars = [torch.rand(3, 128, 128, generator=draw) for _ in range(2)]
     model = Space(settings, draw) if settings.latent else Sampler(settings, draw)
-    colors = model(tables, points, torch.stack(exemplars)) if settings.latent else model(tables, points)
+    colors = model(noise, points, torch.stack(exemplars)) if settings.latent else model(noise, points)
     assert flaw([model], colors, exemplars) == ""
 
 

@@ -8,9 +8,9 @@ import torch
 
 from solidgrain.runtime import load
 from solidgrain.runtime.errors import BundleError, TrainingError
-from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.train.first_sampler import begin_as, mean_code
 from solidgrain.train.loop import Trainer
+from solidgrain.train.noise import runtime_noise
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import PRESETS, preset
 from solidgrain.train.slices import UNIT
@@ -30,9 +30,8 @@ def fresh(exemplar=None, **changes) -> Sampler:
 
 @torch.no_grad()
 def colors(sampler: Sampler, points) -> np.ndarray:
-    sampler.offsets = torch.from_numpy(noise_offsets(7, 32))
-    tables, points = torch.from_numpy(noise_tables(7, 32)).double(), torch.from_numpy(points / UNIT)[None]
-    return sampler.double()(tables, points)[0].numpy()
+    points = torch.from_numpy(points / UNIT)[None]
+    return sampler.double()(runtime_noise(7, 32, points), points)[0].numpy()
 
 
 @pytest.mark.parametrize("principal", [True, False], ids=["principal", "plain"])

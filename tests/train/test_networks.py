@@ -9,12 +9,12 @@ import torch.nn.functional as F
 
 from solidgrain.train.critic import Critic
 from solidgrain.train.losses import color_loss, gradient_penalty, gram_matrices, mean_gram, style_loss
-from solidgrain.train.noise import draw_tables, look_up, shift_tables
+from solidgrain.train.noise import Noise, draw_noise, look_up
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import FAST, PAPER, preset, rate
 from solidgrain.train.slices import about_axis, draw_rotations, draw_slices, flat_slice
 from solidgrain.train.space import Space
-from solidgrain.train.task import Noise
+from solidgrain.train.task import Instances
 from tests.reference import locate, noise
 
 
@@ -39,10 +39,10 @@ def test_the_critic_takes_other_patch_sizes(size):
 
 def test_noise_lookup_is_trilinear_and_periodic():
     settings = preset("fast", octaves=4)
-    tables = torch.randn(4, 64, 64, 64, generator=generator())
+    instance = draw_noise(4, 64, generator())
     transforms = Sampler(settings, generator()).transforms().detach()
     points = torch.randn(1, 20, 3, generator=generator()) * 40
-    found = look_up(tables, transforms, points)[0]
+    found, tables = look_up(instance, transforms, points)[0], instance.tables[:, :64, :64, :64]
     for point, values in zip(points[0], found, strict=True):
         for table, transform, value in zip(tables, transforms, values, strict=True):
             expected = noise(table.numpy(), locate(transform.numpy(), tuple(point.tolist())))
@@ -50,38 +50,38 @@ def test_noise_lookup_is_trilinear_and_periodic():
 
 
 def test_noise_lookup_stays_in_float32_under_autocast():
-    tables, points = torch.randn(4, 64, 64, 64, generator=generator()), torch.rand(1, 50, 3, generator=generator()) * 4
+    instance, points = draw_noise(4, 64, generator()), torch.rand(1, 50, 3, generator=generator()) * 4
     transforms = torch.randn(4, 3, 3, generator=generator()) * 8
     with torch.autocast("cpu", torch.bfloat16):
-        reduced = look_up(tables, transforms, points)
+        reduced = look_up(instance, transforms, points)
     assert reduced.dtype == torch.float32
-    assert torch.equal(reduced, look_up(tables, transforms, points))
+    assert torch.equal(reduced, look_up(instance, transforms, points))
 
 
-def test_a_shifted_table_holds_the_same_noise_elsewhere():
-    tables, points = draw_tables(3, 16, generator()), 40 * torch.rand(1, 50, 3, generator=generator())
-    random = generator()
-    shifts = torch.randint(16, (3, 3), generator=generator()).float()
-    moved, turned = shift_tables(tables, random), Sampler(preset("fast", octaves=4), generator()).directions[:3].detach()
-    expected = look_up(tables, turned, points, offsets=-shifts)
-    assert torch.allclose(look_up(moved, turned, points), expected, atol=1e-4)
-    assert not torch.equal(shift_tables(tables, random), moved)
+def test_moved_noise_is_the_same_noise_elsewhere():
+    instance, points = draw_noise(3, 16, generator()), 40 * torch.rand(1, 50, 3, generator=generator())
+    moved, along = instance.moved(generator()), 2 * torch.eye(3).expand(3, 3, 3)
+    for octave, offset in enumerate(moved.offsets):
+        expected = look_up(instance, along, points + offset / 2)[..., octave]
+        assert torch.allclose(look_up(moved, along, points)[..., octave], expected, atol=1e-4)
+    assert moved.offsets.min() >= 0
+    assert 8 < moved.offsets.max() < 16
 
 
 def test_shared_noise_is_another_instance_in_each_batch_and_no_other_numbers():
     for shared in (True, False):
-        noise, random = Noise(preset("fast", shared_noise=shared), torch.device("cpu")), generator()
-        first, second = noise.draw(random), noise.draw(random)
-        assert not torch.equal(first, second)
-        assert torch.equal(first[3].flatten().sort()[0], second[3].flatten().sort()[0]) == shared
+        instances, random = Instances(preset("fast", shared_noise=shared), torch.device("cpu")), generator()
+        first, second = instances.draw(random), instances.draw(random)
+        assert torch.equal(first.offsets, second.offsets) != shared
+        assert torch.equal(first.tables, second.tables) == shared
 
 
 def test_each_octave_enters_one_hidden_layer_and_the_last_layer_gets_none():
     sampler = Sampler(PAPER, generator())
     assert len(sampler.hidden) == 5
     assert sampler.noise_weights.shape == (4, 4, 128)
-    tables = torch.zeros(16, 64, 64, 64)
-    still = sampler(tables, flat_slice(8, torch.device("cpu"))[None])
+    silence = Noise(torch.zeros(16, 65, 65, 65), torch.zeros(16, 3))
+    still = sampler(silence, flat_slice(8, torch.device("cpu"))[None])
     assert torch.allclose(still, still[:, :1].expand_as(still))  # without noise, one constant colour
 
 
@@ -184,12 +184,12 @@ def test_colours_are_float32_where_hidden_layers_are_not():
     """A bright colour in bfloat16 has steps of 1/256, as large as a faint material's contrast."""
     sampler = Sampler(preset("fast", octaves=8), generator())
     sampler.take_colors(torch.full((3,), 0.9), 1e-6 * torch.eye(3))
-    tables, points = torch.randn(8, 64, 64, 64, generator=generator()), torch.rand(1, 99, 3, generator=generator())
+    instance, points = draw_noise(8, 64, generator()), torch.rand(1, 99, 3, generator=generator())
     with torch.autocast("cpu", torch.bfloat16), torch.no_grad():
-        rgb = sampler(tables, points)
+        rgb = sampler(instance, points)
     assert rgb.dtype == torch.float32
     assert not torch.equal(rgb, rgb.bfloat16().float())
-    torch.testing.assert_close(rgb, sampler(tables, points).detach(), atol=1e-4, rtol=0)
+    torch.testing.assert_close(rgb, sampler(instance, points).detach(), atol=1e-4, rtol=0)
 
 
 def test_what_the_latent_code_says_of_a_texture_is_float32_where_other_layers_are_not():

@@ -56,7 +56,7 @@ class Copies(torch.nn.Module):
         super().__init__()
         self.pixels, self.noise, self.generator = torch.from_numpy(pixels), noise, torch.Generator().manual_seed(3)
 
-    def forward(self, tables, points):
+    def forward(self, noise, points):
         size = round(points.shape[1] ** 0.5)
         top, left = torch.randint(0, 160 - size, (2,), generator=self.generator).tolist()
         patch = self.pixels[top : top + size, left : left + size].reshape(1, -1, 3).repeat(len(points), 1, 1)

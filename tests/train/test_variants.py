@@ -17,6 +17,7 @@ from solidgrain.train.critic import Critic
 from solidgrain.train.cuts import as_image
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.losses import make_judge, style_loss
+from solidgrain.train.noise import draw_noise
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, open_run
 from solidgrain.train.sampler import NoiseAtInputSampler, Sampler, make_sampler
@@ -95,11 +96,11 @@ def test_noise_at_the_input_is_a_plain_perceptron_on_the_noise():
     sampler = make_sampler(vary(FAST, "noise-at-input"), generator())
     assert isinstance(sampler, NoiseAtInputSampler)
     assert [tuple(layer.weight.shape) for layer in sampler.hidden] == [(128, 32)] + 4 * [(128, 128)]
-    tables, points = torch.randn(32, 64, 64, 64, generator=generator()), torch.rand(1, 9, 3, generator=generator())
-    x = sampler.noise(tables, points)
+    noise, points = draw_noise(32, 64, generator()), torch.rand(1, 9, 3, generator=generator())
+    x = sampler.eta(noise, points)
     for layer in sampler.hidden:
         x = torch.nn.functional.leaky_relu(layer(x), 0.2)
-    torch.testing.assert_close(sampler(tables, points), sampler.output(x))
+    torch.testing.assert_close(sampler(noise, points), sampler.output(x))
 
 
 def test_every_variant_but_two_has_the_paper_s_sampler():
