@@ -44,6 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     from solidgrain.train.inception import Inception
     from solidgrain.train.photograph import read_exemplar
     from solidgrain.train.quality import SMALLEST
+    from solidgrain.train.run import pixels_sha256
 
     if arguments.sheet:
         check_sheet(arguments.sheet, arguments.exemplar)
@@ -58,7 +59,15 @@ def run(arguments: argparse.Namespace) -> int:
     tell(f"measuring {2 * arguments.slices} slices of {texture.name} against {arguments.exemplar}{reduced}")
     found = measure(texture, exemplar, arguments.slices, inception, tell)
     figures = found.figures
-    print(json.dumps(found.as_json(), indent=2) if arguments.json else figures.markdown())
+    about = {
+        "texture": texture.name,
+        "texture_sha256": texture.data.sha256,
+        "sampler_sha256": texture.data.sampler_sha256,
+        "exemplar": str(arguments.exemplar),
+        "exemplar_sha256": pixels_sha256(exemplar),  # as the manifest of its training has it
+        "patch_scale": scale,
+    }
+    print(json.dumps(about | found.as_json(), indent=2) if arguments.json else figures.markdown())
     if arguments.sheet:
         sheet = make_sheet(texture.name, exemplar, texture.sample, grain_of(texture.bundle), found.pairs, figures)
         write_sheet(arguments.sheet, sheet)

@@ -13,7 +13,7 @@ from solidgrain.bake.flags import add_cut
 from solidgrain.bake.messages import tell, tell_next, warn
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.space import DEFAULT_SPACE
-from solidgrain.train.command import INTERRUPTED, choose_device
+from solidgrain.train.command import INTERRUPTED, choose_device, warn_if_uneven
 from solidgrain.train.console import Progress, StopRequest
 
 if TYPE_CHECKING:
@@ -134,7 +134,9 @@ def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData
     patch, note = cut_patch(photograph.pixels, space.patch, cut, str(arguments.photo))
     tell(note)
     start = space.own(space.encode(patch, arguments.photo.stem, cut.scale or 1.0))
-    return start, patch if cut.corner else scaled(photograph.pixels, cut.scale or 1.0)
+    material = patch if cut.corner else scaled(photograph.pixels, cut.scale or 1.0)
+    warn_if_uneven(arguments.photo, material)
+    return start, material
 
 
 def say(found: Adapted, space: Space, arguments: argparse.Namespace) -> None:

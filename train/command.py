@@ -19,6 +19,7 @@ from solidgrain.train.variants import CHANGES, canonical
 if TYPE_CHECKING:
     import torch
 
+    from solidgrain.train.exemplar import FloatArray
     from solidgrain.train.loop import Ending, Report
     from solidgrain.train.processes import Processes
     from solidgrain.train.run import Run, RunFolder
@@ -239,7 +240,8 @@ def about_uneven(run: SpaceRun) -> str:
     """Which photographs one texture cannot describe, or ""."""
     from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
 
-    uneven = [member.name for member in run.trained_on if nonstationarity(member.exemplar) > NONSTATIONARY]
+    changes = {member.name: nonstationarity(member.exemplar) for member in run.trained_on}
+    uneven = [f"{name} ({change:.2f})" for name, change in changes.items() if change > NONSTATIONARY]
     count = f"{len(uneven)} of {len(run.trained_on)} photographs"
     what = f"change across themselves (nonstationarity above {NONSTATIONARY})"
     return f"{count} {what}: {some(uneven)}; crop even parts of them for better results" if uneven else ""
@@ -283,7 +285,6 @@ def held_out_names(text: str | None) -> int | list[str]:
 
 def start(arguments: argparse.Namespace) -> Run:
     """A new run directory for the photograph, with a warning if one texture cannot describe it."""
-    from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
     from solidgrain.train.photograph import read_photograph, scaled
     from solidgrain.train.run import Source, create_run, pixels_sha256
 
@@ -299,15 +300,22 @@ def start(arguments: argparse.Namespace) -> Run:
     exemplar = scaled(photograph, scale)
     if warning:
         warn(f"{arguments.exemplar}: {warning}")
-    if (found := nonstationarity(exemplar)) > NONSTATIONARY:
-        warn(
-            f"{arguments.exemplar} changes across itself (nonstationarity {found:.2f}, above {NONSTATIONARY}); "
-            "crop an even part of it for better results"
-        )
+    warn_if_uneven(arguments.exemplar, exemplar)
     settings = with_grain(settings, arguments.anisotropic, exemplar)
     of_photograph = "" if scale == 1 else pixels_sha256(photograph)
     source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace, scale, of_photograph)
     return create_run(arguments.out, settings, exemplar, source, make_budget(arguments, settings))
+
+
+def warn_if_uneven(path: Path, exemplar: FloatArray) -> None:
+    """Say that one texture cannot describe a photograph, if that is so."""
+    from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
+
+    if (found := nonstationarity(exemplar)) > NONSTATIONARY:
+        warn(
+            f"{path} changes across itself (nonstationarity {found:.2f}, above {NONSTATIONARY}); "
+            "crop an even part of it for better results"
+        )
 
 
 def make_settings(arguments: argparse.Namespace) -> Settings:

@@ -20,6 +20,7 @@ import OpenImageIO as oiio
 
 from solidgrain.export.figures import Figures
 from solidgrain.export.sheet import aligned, as_html, as_png, make_sheet, write_sheet
+from solidgrain.runtime import load_texture
 from solidgrain.runtime.errors import SolidgrainError
 from solidgrain.train.copying import Pair
 from tests.train.conftest import blotches
@@ -153,7 +154,10 @@ def test_the_command_writes_the_sheet_and_reports_copying(solidgrain, toy_folder
         "evaluate", toy_folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--sheet", tmp_path / "a.html", "--json"
     )
     assert outcome.code == 0, outcome.err
-    assert json.loads(outcome.out)["copying"].keys() == {"patches", "floor", "ratio", "closer"}
+    found = json.loads(outcome.out)
+    assert found["copying"].keys() == {"patches", "floor", "ratio", "closer"}
+    assert (found["texture"], found["patch_scale"]) == ("toy", 1.0)
+    assert found["sampler_sha256"] == load_texture(toy_folder).data.sampler_sha256
     page = (tmp_path / "a.html").read_text("utf-8")
     assert "toy" in page
     assert re.search(r"<td>vgg_frechet</td>", page)

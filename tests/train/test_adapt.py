@@ -299,6 +299,12 @@ def test_a_crop_is_all_that_is_adapted_to(solidgrain, toy_space_folder, tmp_path
     np.testing.assert_allclose(of_whole.latent, of_crop.latent, atol=1e-5)
 
 
+def test_a_photograph_that_changes_across_itself_gets_a_warning_that_names_the_figure(solidgrain, toy_space_folder, tmp_path):
+    ramp = write(tmp_path / "ramp.png", np.linspace(0, 1, 150)[:, None, None] * np.ones((150, 140, 3)))
+    flags = ("--bundle", toy_space_folder, "--out", tmp_path / "a.sgt.npz", "--iterations", 1, "--threads", 1)
+    assert "nonstationarity 0.9" in solidgrain("adapt", ramp, *flags).err
+
+
 @pytest.mark.parametrize(
     ("flags", "code", "message"),
     [

@@ -190,7 +190,7 @@ def test_photographs_that_change_across_themselves_are_named(solidgrain, tmp_pat
     outcome = solidgrain("train", "--space", folder, "--out", tmp_path / "run", *SMALL, "--iterations", 1)
     assert outcome.code == 0, outcome.err
     (warning,) = [line for line in outcome.err.splitlines() if "of 3 photographs change across themselves" in line]
-    assert "(nonstationarity above 0.3): evening sky.png" in warning
+    assert "(nonstationarity above 0.3): evening sky.png (0.9" in warning
 
 
 def test_held_out_photographs_that_the_warm_start_has_seen_are_named(solidgrain, tmp_path, small_presets):
