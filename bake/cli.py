@@ -80,7 +80,11 @@ def _run(arguments: list[str]) -> int:
         parser, module = _parser(arguments)
     except ModuleNotFoundError as error:
         return _missing(error, _called(arguments))
-    options = parser.parse_args(arguments)
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        Parser(prog=" ".join(["solidgrain", *filter(None, [options.command])])).error(
+            f"unrecognized arguments: {' '.join(unknown)}"
+        )
     if module is None:
         parser.print_help()
         return USAGE

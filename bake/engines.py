@@ -71,6 +71,10 @@ def check_engine(engine: str, output: Output, volume: Volume) -> None:
             f"--for unreal: {output.path} is {output.options['type']}, Unreal imports no block-compressed DDS; use "
             "--dds-type rgba8, Unreal compresses it itself"
         )
+    if output.kind in ATLASES and output.options["mips"]:
+        raise UsageError(
+            f"--for {engine}: {output.path} is an atlas, whose levels {preset.name} makes itself; leave out --mips"
+        )
     if output.kind in ATLASES:
         _check_atlas(engine, output, volume)
 

@@ -22,6 +22,7 @@ from solidgrain.runtime.errors import BakeError, SolidgrainError, UsageError
 
 if TYPE_CHECKING:
     from solidgrain.bake.plan import Plan
+    from solidgrain.bake.writers import Output
     from solidgrain.runtime import Texture
 
 DONE, FAILED, SKIPPED = "done", "failed", "skipped"
@@ -177,7 +178,9 @@ def plan_jobs(
             settle(job.arguments)
             if job.texture not in textures:
                 textures[job.texture] = load(job.arguments)
-            planned.append(Planned(job, _with_settings(make_plan(job.arguments, textures[job.texture]), job)))
+            plan = make_plan(job.arguments, textures[job.texture])
+            plan = replace(plan, outputs=tuple(with_settings(output, job) for output in plan.outputs))
+            planned.append(Planned(job, plan))
     checked = []
     for one in planned:
         with _named(one.job.where):
@@ -186,18 +189,19 @@ def plan_jobs(
     return checked, textures
 
 
-def _with_settings(plan: Plan, job: Job) -> Plan:
-    """The plan with what the job says of single outputs."""
+def with_settings(output: Output, job: Job) -> Output:
+    """One of a job's outputs, with what the job says of it alone. Raises UsageError."""
     from solidgrain.bake.engines import axes_for
     from solidgrain.bake.schema import checked_output
+    from solidgrain.bake.writers.orient import UPRIGHT
 
-    outputs = []
-    for output in plan.outputs:
-        own = {"engine" if key == "for" else key: value for key, value in job.settings.get(output.path, {}).items()}
-        if own.get("engine") and "axes" not in own:
-            own = {**own, "axes": axes_for(str(own["engine"]), output.kind)}
-        outputs.append(checked_output(output, f"out {output.path.name}", **own))
-    return replace(plan, outputs=tuple(outputs))
+    own = {"engine" if key == "for" else key: value for key, value in job.settings.get(output.path, {}).items()}
+    if "engine" in own and "axes" not in own:
+        own["axes"] = axes_for(str(own["engine"]), output.kind) if own["engine"] else UPRIGHT
+    given = output.options
+    if job.arguments.colorspace is None:  # its own type may have colours of its own
+        given = {key: value for key, value in given.items() if key not in ("colorspace", "colorconfig")}
+    return checked_output(replace(output, options=given), f"out {output.path.name}", **own)
 
 
 def _check_names(planned: Sequence[Planned]) -> None:

@@ -21,7 +21,8 @@ def off_screen_environment() -> None:
 
 
 def has_display() -> bool:
-    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    """Whether there may be one. VTK opens windows by X11, and not on Wayland alone."""
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY"))
 
 
 def opengl_error() -> str | None:

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from solidgrain.bake.color import LINEAR, SRGB, quantize, to_srgb
 from solidgrain.bake.masks import DAMAGED_ARRAY
+from solidgrain.bake.messages import warn
 from solidgrain.bake.opengl import has_display, off_screen_environment, require_opengl
 from solidgrain.runtime.errors import ViewError
 from solidgrain.runtime.files import temporary_name
@@ -17,11 +19,15 @@ from solidgrain.runtime.files import temporary_name
 if TYPE_CHECKING:
     import pyvista
 
+NO_DISPLAY = "no display to open a window on; use --screenshot FILE.png"
+WITHOUT_A_WINDOW = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # what VTK falls back to
+
 
 def read_volume(path: Path) -> pyvista.ImageData:
-    """A volume with RGB point data `rgb` (uint8), from `.vti` (or what else pyvista reads) or `.npy` [z, y, x, 3].
+    """A volume with point data `rgb` (uint8, sRGB-encoded), from `.vti` (or what else pyvista reads) or `.npy` [z, y, x, 3].
 
-    Floats are colours from 0 to 1, unsigned whole numbers from 0 to the largest of their type.
+    Floats are colours from 0 to 1, unsigned whole numbers from 0 to the largest of their type; sRGB-encoded, unless the field
+    data `color_encoding` says otherwise.
     Raises ViewError if the file is missing, unreadable or holds no colours.
     """
     import pyvista
@@ -33,9 +39,15 @@ def read_volume(path: Path) -> pyvista.ImageData:
         image = pyvista.read(os.fspath(path))
     except Exception as error:  # VTK's readers raise several unrelated types
         raise ViewError(f"{path}: not readable as a volume ({str(error).splitlines()[0]})") from error
-    if not isinstance(image, pyvista.ImageData) or "rgb" not in image.point_data or image.point_data["rgb"].ndim != 2:
+    if not isinstance(image, pyvista.ImageData) or "rgb" not in image.point_data:
         raise ViewError(f"{path}: expected image data with a point array 'rgb', found {_contents(image)}")
-    image.point_data["rgb"] = _bytes(np.asarray(image.point_data["rgb"]))
+    colors = np.asarray(image.point_data["rgb"])
+    if colors.ndim != 2 or colors.shape[1] not in (3, 4) or colors.dtype.kind not in "fu":
+        raise ViewError(
+            f"{path}: 'rgb' is {colors.dtype} of shape {colors.shape}, expected 3 or 4 floats or unsigned whole numbers a point"
+        )
+    encoding = str(image.field_data["color_encoding"][0]) if "color_encoding" in image.field_data else SRGB
+    image.point_data["rgb"] = _bytes(path, colors[:, :3], encoding)
     return image
 
 
@@ -55,30 +67,34 @@ def _from_array(path: Path) -> pyvista.ImageData:
         raise ViewError(
             f"{path}: {array.dtype} of shape {array.shape}, expected floats or unsigned whole numbers, [z, y, x, 3]"
         )
-    if not np.isfinite(array).all():
-        raise ViewError(f"{path}: holds NaN or infinity, expected colours from 0 to 1")
     image = pyvista.ImageData(dimensions=array.shape[2::-1], origin=(0.5, 0.5, 0.5))
-    image.point_data["rgb"] = _bytes(array.reshape(-1, 3))
+    image.point_data["rgb"] = _bytes(path, array.reshape(-1, 3), SRGB)
     return image
 
 
-def _bytes(colors: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-    if colors.dtype == np.uint8:
+def _bytes(path: Path, colors: npt.NDArray[Any], encoding: str) -> npt.NDArray[np.uint8]:
+    """Colours [P, 3] as a screen takes them. Raises ViewError for what is no number."""
+    if not np.isfinite(colors).all():
+        raise ViewError(f"{path}: holds NaN or infinity, expected colours from 0 to 1")
+    if encoding not in (SRGB, LINEAR):
+        warn(f"{path}: its colours are {encoding}, and are shown as if they were {SRGB}")
+    if colors.dtype == np.uint8 and encoding != LINEAR:
         return colors
     largest = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1
-    scaled: npt.NDArray[np.uint8] = (np.clip(colors, 0, largest) * np.float32(255 / largest) + 0.5).astype(np.uint8)
-    return scaled
+    shares = np.clip(colors, 0, largest) * np.float32(1 / largest)
+    encoded = to_srgb(shares.astype(np.float32)) if encoding == LINEAR else shares
+    return quantize(encoded, np.uint8).astype(np.uint8, copy=False)
 
 
 def show(path: Path, mode: str = "slices", screenshot: Path | None = None, size: tuple[int, int] = (1024, 768)) -> None:
     """Show a volume in a window, or draw it off screen into a PNG.
 
-    Raises ViewError where there is no OpenGL library, and for a window where there is no display.
+    Raises ViewError where there is no OpenGL library, and for a window where no display answers.
     """
     if not path.is_file():
         raise ViewError(f"{path}: no such file; expected a volume made by solidgrain bake (.vti or .npy)")
     if screenshot is None and not has_display():
-        raise ViewError("no display to open a window on; use --screenshot FILE.png")
+        raise ViewError(NO_DISPLAY)
     if screenshot is not None and (screenshot.suffix.lower() != ".png" or not screenshot.parent.is_dir()):
         raise ViewError(f"--screenshot {screenshot}: expected a name that ends in .png in a folder that exists")
     image = read_volume(path)
@@ -87,8 +103,11 @@ def show(path: Path, mode: str = "slices", screenshot: Path | None = None, size:
     import pyvista
 
     plotter: Any = pyvista.Plotter(off_screen=screenshot is not None, window_size=list(size))
+    if screenshot is None and plotter.render_window.GetClassName() in WITHOUT_A_WINDOW:
+        plotter.close()
+        raise ViewError(f"{NO_DISPLAY} (DISPLAY is {os.environ.get('DISPLAY')}, which does not answer)")
     plotter.set_background("#1f1f1f")
-    _add(plotter, image, mode, interactive=screenshot is None)
+    _add(plotter, _on_stage(image), mode, interactive=screenshot is None)
     plotter.add_axes()
     plotter.camera_position = "iso"
     if screenshot is None:
@@ -105,6 +124,14 @@ def show(path: Path, mode: str = "slices", screenshot: Path | None = None, size:
         plotter.close()
 
 
+def _on_stage(image: pyvista.ImageData) -> pyvista.ImageData:
+    """The volume at the origin, with voxels of about 1: VTK draws in float32, and steps through a volume by so much."""
+    staged: pyvista.ImageData = image.copy(deep=False)
+    staged.origin = (0.0, 0.0, 0.0)
+    staged.spacing = tuple(step / max(image.spacing) for step in image.spacing)
+    return staged
+
+
 def _add(plotter: Any, image: pyvista.ImageData, mode: str, interactive: bool) -> None:
     """Put the volume on the stage. In a window, slices and threshold have widgets to move them."""
     if mode == "slices":
@@ -115,7 +142,7 @@ def _add(plotter: Any, image: pyvista.ImageData, mode: str, interactive: bool) -
     elif mode == "volume":
         rgba = np.column_stack([image.point_data["rgb"], luma(image)])  # VTK takes the opacity from the fourth component
         image.point_data["rgba"] = rgba
-        plotter.add_volume(image, scalars="rgba", opacity_unit_distance=4 * max(image.spacing))
+        plotter.add_volume(image, scalars="rgba", opacity_unit_distance=4)
     elif mode == "threshold":
         image.point_data["luma"] = luma(image)
         middle = float(np.median(image.point_data["luma"]))

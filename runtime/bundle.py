@@ -76,7 +76,7 @@ def open_bundle(folder: Path) -> Bundle:
                 f"{path}: sha256 is {found[:12]}…, the manifest expects {expected[:12]}…; "
                 "the file is damaged or belongs to another bundle"
             )
-    return Bundle(folder, manifest)
+    return Bundle(folder.absolute(), manifest)  # wherever the process works later
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:

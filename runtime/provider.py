@@ -14,15 +14,17 @@ if TYPE_CHECKING:
     import onnxruntime
 
 SUFFIX = "ExecutionProvider"
+REMOTE = "AzureExecutionProvider"  # calls services, and leaves every other node of a graph to the CPU
 ALIASES = {"directml": "dml"}
 DEVICES = {"CUDAExecutionProvider": "cuda", "TensorrtExecutionProvider": "cuda", "DmlExecutionProvider": "dml"}
 
 
-def available_providers() -> list[str]:
-    """Short names of the providers that this ONNX Runtime can really use, such as "cpu" and "cuda"."""
+def available_providers() -> dict[str, str]:
+    """The providers that this ONNX Runtime can really use: full names by short ones, such as "cpu" and "cuda"."""
     import onnxruntime
 
-    return [name.removesuffix(SUFFIX).lower() for name in onnxruntime.get_available_providers() if name.endswith(SUFFIX)]
+    names = [name for name in onnxruntime.get_available_providers() if name.endswith(SUFFIX) and name != REMOTE]
+    return {name.removesuffix(SUFFIX).lower(): name for name in names}
 
 
 def provider_options(full_name: str) -> dict[str, Any]:
@@ -62,7 +64,7 @@ def open_session(path: Path, provider: str) -> onnxruntime.InferenceSession:
     """
     import onnxruntime
 
-    offered = {name.removesuffix(SUFFIX).lower(): name for name in onnxruntime.get_available_providers()}
+    offered = available_providers()
     full_name = offered.get(ALIASES.get(provider, provider))
     if full_name is None:
         raise ProviderError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -70,6 +71,8 @@ class Space:
         first, and the texture's pixels are then the smaller picture's. `scale` is by how much it was: the texture remembers
         it, for whoever compares it with the photograph.
         """
+        if not 0 < scale < math.inf:
+            raise ExemplarError(f"scale {scale!r}: expected a number above 0")
         return self.open(replace(self.mapped(self.code(exemplar), name), scale=float(scale)))
 
     def code(self, exemplar: npt.ArrayLike) -> FloatArray:

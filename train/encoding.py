@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 FloatArray = npt.NDArray[np.float32]
 
 SRGB, LINEAR, XYZ = "srgb_rec709_scene", "lin_rec709_scene", "lin_ciexyzd65_scene"
-UNSTATED = ("", "data", "unknown")  # interop identifiers that say nothing of colour
+UNSTATED = ("", "data", "unknown", "Rec709")  # these say nothing of colour; the last is in all PPM and PGM files
 BUILT_IN, RUNNING = "ocio://default", ""  # OpenColorIO configurations
 UNCALIBRATED = (2, 65535)  # Exif colour spaces: Adobe RGB in some cameras' files, "not sRGB" in all
 BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])  # ICC.1, Annex E

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -37,11 +38,11 @@ def read_exemplar(path: str | os.PathLike[str], smallest: int, scale: float = 1.
 def read_photograph(path: str | os.PathLike[str], smallest: int, advice: str = ADVICE) -> Photograph:
     """A photograph as sRGB-encoded RGB, [H, W, 3] float32 in [0, 1].
 
-    Anything that OpenImageIO reads: 8 and 16 bit, float, grey (repeated), alpha (dropped), CMYK (converted by its reader), as
-    viewers show it: turned as Exif's Orientation says.
+    Anything that OpenImageIO reads: 8 and 16 bit, float, grey (repeated), alpha (dropped), CMYK (converted by its reader), the
+    coloured layer of an EXR with one; as viewers show it: turned as Exif's Orientation says.
     Colours of another space that the file declares (encoding.py) are converted to sRGB and clipped. Raises ExemplarError when
-    the file is missing, unreadable, incomplete, smaller than `smallest` pixels along an axis (`advice` says what to do then) or
-    larger than `LARGEST` pixels.
+    the file is missing, unreadable, incomplete, without colours or with several layers of them, smaller than `smallest` pixels
+    along an axis (`advice` says what to do then) or larger than `LARGEST` pixels.
     """
     import OpenImageIO as oiio
 
@@ -64,20 +65,42 @@ def read_photograph(path: str | os.PathLike[str], smallest: int, advice: str = A
     try:
         spec = opened.spec()
         _check_size(path, spec, smallest, advice)
-        pixels = opened.read_image(oiio.FLOAT)
+        colors, alpha = _channels(path, spec.channelnames)
+        first, last = (limit((*colors, alpha)) for limit in (min, max))
+        pixels = opened.read_image(0, 0, first, last + 1, oiio.FLOAT)
         error = opened.geterror()
     finally:
         opened.close()
     if pixels is None or error:
         raise ExemplarError(f"{path}: the image data is damaged or cut short ({_first_line(error)}); export it again")
-    rgb = np.asarray(pixels, np.float32)[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
-    hidden = spec.alpha_channel >= 0 and bool((pixels[..., spec.alpha_channel] < 1).any())
+    rgb = np.asarray(pixels, np.float32)[..., [channel - first for channel in colors]]
+    hidden = alpha not in colors and bool((pixels[..., alpha - first] < 1).any())
     if not np.isfinite(rgb).all():
         raise ExemplarError(f"{path}: holds NaN or infinite pixels; expected finite colours")
     encoded = encode(upright(rgb, spec.get_int_attribute("Orientation", 1)), spec)
     pixels = np.ascontiguousarray(encoded.rgb.clip(0.0, 1.0), np.float32)
     warnings = [encoded.warning, "is transparent in places, whose colours count like the others; crop or fill them" * hidden]
     return Photograph(pixels, encoded.colorspace, "; ".join(filter(None, warnings)))
+
+
+def _channels(path: Path, names: Sequence[str]) -> tuple[list[int], int]:
+    """Where a file has red, green and blue (grey three times), and their alpha, or red again if they have none.
+
+    Colours of no layer count first. OpenImageIO sorts layers by name: the first three channels may be anything.
+    """
+    layers: dict[str, dict[str, int]] = {}
+    for channel, name in enumerate(names):
+        layer, _, part = name.rpartition(".")
+        layers.setdefault(layer, {})[part.upper()] = channel
+    colored = [layer for layer, parts in layers.items() if parts.keys() >= {"R", "G", "B"}]
+    if not colored and len(names) <= 2:
+        return [0, 0, 0], layers.get("", {}).get("A", 0)
+    if len(colored) != 1 and "" not in colored:
+        raise ExemplarError(
+            f"{path}: channels {', '.join(names)}, expected R, G and B, of one layer at most, or grey; export the colours alone"
+        )
+    parts = layers["" if "" in colored else colored[0]]
+    return [parts[part] for part in "RGB"], parts.get("A", parts["R"])
 
 
 def upright(pixels: FloatArray, orientation: int) -> FloatArray:

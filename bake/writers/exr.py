@@ -100,13 +100,14 @@ def slice_header(output: Output, volume: Volume, z: int) -> dict[str, Any]:
     import OpenEXR
 
     compression = str(output.options["compression"])
+    aspect = volume.spacing[0] / volume.spacing[1]
     written = "NO" if compression == "none" or compression in LINES else compression.upper()
     column, row, along = (volume.axes[k : k + 2].lstrip("+") for k in (0, 2, 4))
     header: dict[str, Any] = {
         "compression": getattr(OpenEXR, f"{written}_COMPRESSION"),
         "type": OpenEXR.scanlineimage,
         **color_attributes(output),
-        "pixelAspectRatio": volume.spacing[0] / volume.spacing[1],
+        "pixelAspectRatio": aspect if 1e-6 < aspect < 1e6 else 1.0,  # OpenEXR holds no other
         "solidgrain:texture": volume.texture,
         "solidgrain:model": volume.sampler_sha256,
         "solidgrain:seed": str(volume.seed),  # may exceed an EXR int

@@ -78,10 +78,65 @@ def test_without_opengl_there_is_an_error_instead_of_a_crash(solidgrain, volume,
 
 def test_a_window_needs_a_display(solidgrain, volume, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
     outcome = solidgrain("view", volume / "a.vti")
     assert outcome.code == 1
     assert "--screenshot" in outcome.error
+
+
+def test_a_display_that_does_not_answer_is_an_error_and_no_silence(drawing, volume):
+    """In a process of its own: VTK decides once what its windows are."""
+    command = [sys.executable, "-m", "solidgrain.bake.cli", "view", volume / "a.vti"]
+    outcome = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "DISPLAY": ":99"}, check=False)
+    assert outcome.returncode == 1
+    assert "--screenshot FILE.png (DISPLAY is :99, which does not answer)" in outcome.stderr.splitlines()[-1]
+
+
+def test_linear_colours_are_shown_as_srgb_and_others_as_they_are(solidgrain, toy_folder, volume, tmp_path, capsys):
+    def baked(name, *flags):
+        assert solidgrain("bake", toy_folder, "--size", "24x20x16", "--out", tmp_path / name, *flags).code == 0
+        return read_volume(tmp_path / name).point_data["rgb"].astype(int)
+
+    shown = read_volume(volume / "a.vti").point_data["rgb"]
+    linear = ("--colorspace", "lin_rec709_scene")
+    assert np.abs(baked("whole.vti", *linear, "--vti-type", "uint16") - shown).max() <= 1
+    assert np.abs(baked("float.vti", *linear, "--vti-type", "float32") - shown).max() <= 1
+    capsys.readouterr()
+    assert np.abs(baked("wide.vti", "--colorspace", "ACEScg") - shown).max() > 1
+    assert "are shown as if they were srgb_rec709_scene" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mode", ["volume", "threshold"])
+def test_where_and_how_small_a_volume_is_does_not_show(solidgrain, drawing, toy_folder, tmp_path, mode):
+    pictures = []
+    for name, box in (("near", ()), ("far", ("--origin", "1e9,0,0")), ("small", ("--spacing", "0.001"))):
+        assert solidgrain("bake", toy_folder, "--size", 16, "--out", tmp_path / f"{name}.vti", *box).code == 0
+        image = read_volume(tmp_path / f"{name}.vti")
+        image.point_data["rgb"] = read_volume(tmp_path / "near.vti").point_data["rgb"]
+        image.save(tmp_path / "a.vti")
+        assert solidgrain("view", tmp_path / "a.vti", "--mode", mode, "--screenshot", tmp_path / "a.png").code == 0
+        pictures.append(oiio.ImageBuf(os.fspath(tmp_path / "a.png")).get_pixels(oiio.FLOAT))
+    for picture in pictures[1:]:
+        assert np.abs(picture - pictures[0]).mean() < 0.01
+
+
+@pytest.mark.parametrize("colors", [np.zeros((8, 2)), np.zeros((8, 3), np.int32), np.zeros(8), np.full((8, 3), np.nan)])
+def test_image_data_of_others_that_holds_no_colours_is_refused(solidgrain, tmp_path, colors):
+    import pyvista
+
+    image = pyvista.ImageData(dimensions=(2, 2, 2))
+    image.point_data["rgb"] = colors
+    image.save(tmp_path / "odd.vti")
+    assert "odd.vti" in solidgrain("view", tmp_path / "odd.vti", "--screenshot", tmp_path / "view.png").error
+
+
+def test_alpha_of_others_is_left_out(tmp_path):
+    import pyvista
+
+    image = pyvista.ImageData(dimensions=(2, 1, 1))
+    image.point_data["rgb"] = np.array([[1, 2, 3, 4], [5, 6, 7, 8]], np.uint8)
+    image.save(tmp_path / "rgba.vti")
+    assert read_volume(tmp_path / "rgba.vti").point_data["rgb"].tolist() == [[1, 2, 3], [5, 6, 7]]
 
 
 @pytest.mark.parametrize(

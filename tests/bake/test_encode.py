@@ -347,6 +347,12 @@ def test_what_is_no_photograph_is_refused(toy_space_folder, exemplar, message):
     assert message in str(caught.value)
 
 
+@pytest.mark.parametrize("scale", [0, -1, float("nan"), float("inf")])
+def test_a_scale_that_no_texture_file_may_have_is_refused(toy_space_folder, pixels, scale):
+    with pytest.raises(ExemplarError, match="expected a number above 0"):
+        load_space(toy_space_folder).encode(pixels, scale=scale)
+
+
 def test_bytes_and_floats_encode_alike(toy_space_folder, pixels):
     space = load_space(toy_space_folder)
     np.testing.assert_allclose(space.code(pixels), space.code(np.round(pixels * 255).astype(np.uint8)), atol=1e-6)

@@ -121,6 +121,12 @@ def test_empty_tiles_are_refused_because_they_would_become_slices():
     check_engine("unity", atlas(columns=7), volume_of(7, 16, 16))
 
 
+def test_mip_levels_of_an_atlas_are_refused_for_their_tiles_are_no_ones():
+    output = make_output(Path("a.atlas.png"), mips="box")
+    assert "a.atlas.png is an atlas, whose levels Unity makes itself" in refusal("unity", output, 16, 16, 16)
+    check_engine("unity", dds(mips="box"), volume_of(16, 16, 16))
+
+
 @pytest.mark.parametrize("engine", ["unity", "godot"])
 def test_images_beyond_16384_pixels_a_side_are_refused(engine):
     check_engine(engine, atlas(), volume_of(256, 1024, 1024))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from solidgrain.bake.flags import make_outputs
-from solidgrain.bake.jobs import read_jobs
+from solidgrain.bake.jobs import read_jobs, with_settings
 from solidgrain.bake.writers import Output
 from solidgrain.export.bundle import Details, write_bundle
 from solidgrain.runtime import load_texture
@@ -88,10 +88,8 @@ def test_toml_says_the_same_as_json(solidgrain, tmp_path, toy, toy_folder):
 def outputs_of(path: Path) -> list[Output]:
     from argparse import Namespace
 
-    from solidgrain.bake.schema import checked_output
-
     (job,) = read_jobs(path, Namespace(provider="auto"))
-    return [checked_output(output, "", **job.settings.get(output.path, {})) for output in make_outputs(job.arguments)]
+    return [with_settings(output, job) for output in make_outputs(job.arguments)]
 
 
 def test_a_setting_holds_for_all_outputs_of_its_format_and_an_outputs_own_comes_first(write_jobs):
@@ -123,6 +121,24 @@ def test_an_outputs_own_engine_turns_its_axes(solidgrain, write_jobs, tmp_path):
     assert axes == ["+x-z+y"] * 3
     path = write_jobs({"name": "a", "out": {"path": "a.dds", "engine": "unitee"}})
     assert "unknown engine; pick one of unreal, unity, godot" in solidgrain("bake", "--jobs", path).error
+
+
+def test_an_outputs_own_type_has_the_colours_of_that_type(write_jobs):
+    """A header of half floats cannot say sRGB, and linear bytes would be banded, unless someone asks for it."""
+    half, whole = {"path": "half.dds", "type": "rgba16f"}, {"path": "whole.dds", "type": "rgba8"}
+    (own,) = outputs_of(write_jobs({"name": "a", "out": half}))
+    (flagged,) = outputs_of(write_jobs({"name": "a", "out": "half.dds", "dds_type": "rgba16f"}))
+    assert own.options == flagged.options
+    assert own.colorspace == "lin_rec709_scene"
+    (back,) = outputs_of(write_jobs({"name": "a", "out": whole, "dds_type": "rgba16f"}))
+    assert back.colorspace == "srgb_rec709_scene"
+    (asked,) = outputs_of(write_jobs({"name": "a", "out": half, "colorspace": "srgb_rec709_scene"}))
+    assert asked.colorspace == "srgb_rec709_scene"
+
+
+def test_an_output_may_be_for_no_engine(write_jobs):
+    (plain,) = outputs_of(write_jobs({"name": "a", "out": {"path": "a.dds", "for": ""}, "for": "unity"}))
+    assert (plain.options["engine"], plain.options["axes"]) == ("", "+x+y+z")
 
 
 def test_whole_numbers_may_be_written_as_floats(solidgrain, write_jobs, tmp_path):

@@ -103,6 +103,15 @@ def test_exr_attributes_say_what_a_slice_is(baked, toy):
     assert header["pixelAspectRatio"] == pytest.approx(SPACING[0] / SPACING[1])
 
 
+def test_exr_pixels_of_a_shape_that_no_header_holds_are_called_square(solidgrain, toy_folder, tmp_path):
+    outcome = solidgrain("bake", toy_folder, "--size", 2, "--spacing", "1e-4,1000,1", "--out", tmp_path / "a.####.exr")
+    assert outcome.code == 0, outcome.err
+    with OpenEXR.File(os.fspath(tmp_path / "a.0001.exr")) as file:
+        header = dict(file.header())
+    assert header["pixelAspectRatio"] == 1
+    assert json.loads(header["solidgrain:json"])["spacing"] == [1e-4, 1000, 1]
+
+
 @pytest.mark.parametrize(("x", "y", "z"), VOXELS)
 @pytest.mark.parametrize(("name", "tolerance"), [("toy.vti", 0.5 / 255 + 1e-6), ("float.vti", 0)])
 def test_vti_read_by_vtk_at_the_sampled_point(baked, toy, name, tolerance, x, y, z):

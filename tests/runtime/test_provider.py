@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 
 from solidgrain.runtime import ProviderError, load, onnx_engine
-from solidgrain.runtime.provider import usable_threads
+from solidgrain.runtime.provider import available_providers, usable_threads
 
 OFFERED = ["CUDAExecutionProvider", "DmlExecutionProvider", "CoreMLExecutionProvider", "OpenVINOExecutionProvider"]
 NAMES = {"cuda": OFFERED[0], "directml": OFFERED[1], "dml": OFFERED[1], "coreml": OFFERED[2], "OpenVINO": OFFERED[3]}
@@ -51,6 +51,13 @@ def test_a_provider_is_chosen_by_its_name_and_by_no_other(machine, toy_folder, n
     assert texture.provider_note == ""
     reference = load(toy_folder, provider="cpu")
     assert np.array_equal(texture.grid((3, 30, 40), 2), reference.grid((3, 30, 40), 2))
+
+
+def test_a_provider_that_computes_elsewhere_is_not_offered(monkeypatch, toy_folder):
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["AzureExecutionProvider", "CPUExecutionProvider"])
+    assert list(available_providers()) == ["cpu"]
+    with pytest.raises(ProviderError, match=r"has: cpu;"):
+        load(toy_folder, provider="azure")
 
 
 def test_float32_is_float32(machine, toy_folder):

@@ -197,6 +197,14 @@ def test_arguments_that_make_no_sense_are_refused_with_their_name(toy, call, mes
         call(toy)
 
 
+def test_a_texture_of_a_relative_path_goes_along_when_the_process_changes_its_folder(toy_folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(toy_folder.parent)
+    texture = load(toy_folder.name, provider="cpu")
+    pickled = pickle.dumps(texture)
+    monkeypatch.chdir(tmp_path)
+    assert np.array_equal(pickle.loads(pickled).sample([[1, 2, 3]]), copy.deepcopy(texture).sample([[1, 2, 3]]))
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda texture: pickle.loads(pickle.dumps(texture))])
 def test_a_copy_in_this_process_or_another_is_the_same_texture(toy, copied):
     points = np.random.default_rng(0).normal(0, 100, (50, 3))

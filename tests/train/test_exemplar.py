@@ -67,6 +67,52 @@ def test_colours_are_not_multiplied_by_alpha(tmp_path):
     assert read_photograph(tmp_path / "opaque.png", 64).warning == ""
 
 
+def layered(path, **channels):
+    """An EXR with a constant value in each channel."""
+    spec = oiio.ImageSpec(64, 64, len(channels), oiio.FLOAT)
+    spec.channelnames = [name.replace("_", ".") for name in channels]
+    image = oiio.ImageBuf(spec)
+    oiio.ImageBufAlgo.fill(image, list(channels.values()))
+    assert image.write(os.fspath(path)), image.geterror()
+    return path
+
+
+@pytest.mark.parametrize(
+    "others", [{"N_X": 0.9, "N_Y": 0.9, "N_Z": 0.9}, {"height": 0.9, "A_id": 0.9}, {"albedo_A": 0.2}, {"B": 0.7}]
+)
+def test_of_an_exr_with_layers_the_colours_are_read(tmp_path, others):
+    """Whatever their place: OpenImageIO sorts channels by the names of their layers."""
+    path = layered(tmp_path / "a.exr", **{"albedo_R": 1.0, "albedo_G": 0.0, "albedo_B": 1.0}, **others)
+    photograph = read_photograph(path, 64)
+    np.testing.assert_allclose(photograph.pixels[5, 7], [1, 0, 1])
+    assert ("transparent" in photograph.warning) == ("albedo_A" in others)
+
+
+def test_colours_of_no_layer_count_first(tmp_path):
+    path = layered(tmp_path / "a.exr", a_R=0.5, a_G=0.5, a_B=0.5, b_R=0.5, b_G=0.5, b_B=0.5, R=1.0, G=1.0, B=0.0)
+    np.testing.assert_allclose(read_exemplar(path, 64)[0, 0], [1, 1, 0])
+
+
+@pytest.mark.parametrize("names", [("N_X", "N_Y", "N_Z"), ("Y", "BY", "RY"), ("a_R", "a_G", "a_B", "b_R", "b_G", "b_B")])
+def test_an_exr_whose_colours_are_in_doubt_is_refused_with_its_channels(tmp_path, names):
+    with pytest.raises(ExemplarError, match=r"a\.exr: channels .*, expected R, G and B, of one layer at most, or grey"):
+        read_exemplar(layered(tmp_path / "a.exr", **dict.fromkeys(names, 0.5)), 64)
+
+
+def test_a_gif_is_a_photograph_too(tmp_path):
+    write(tmp_path / "a.gif", np.ones((64, 64, 3)))
+    photograph = read_photograph(tmp_path / "a.gif", 64)
+    assert (photograph.pixels.min(), photograph.warning) == (1, "")
+
+
+@pytest.mark.parametrize("suffix", ["ppm", "pgm"])
+def test_what_the_reader_says_of_all_portable_pixmaps_is_no_declaration(tmp_path, suffix):
+    write(tmp_path / f"a.{suffix}", np.full((64, 64, 3 if suffix == "ppm" else 1), 100 / 255))
+    photograph = read_photograph(tmp_path / f"a.{suffix}", 64)
+    assert photograph.pixels.max() == pytest.approx(100 / 255)
+    assert (photograph.colorspace, photograph.warning) == ("srgb_rec709_scene", "")
+
+
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
 def test_a_photograph_is_turned_as_its_orientation_says(tmp_path, suffix):
     shown = np.zeros((80, 64, 3))
