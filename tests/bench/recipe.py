@@ -39,7 +39,6 @@ DEFAULTS = [  # the embedded critic, which FAST starts from, has seen none of th
 MARKS = [2.0, 4.0, 6.0]
 LARGEST = 256  # pixels: of larger photographs the middle
 SMALLEST = 128
-FROM_NOISE = 2e-3  # S's rate, where it does not start as a stone
 SHOWN = ("vgg_frechet", "gram")
 Found = Mapping[str, Mapping[str, Mapping[str, Any]]]  # by row, then by cell: exemplar, seed and mark
 
@@ -51,14 +50,13 @@ def as_paper(*names: str) -> Settings:
 
 def from_noise(*names: str) -> Settings:
     """The same, with S starting from N(0,1): some settings say how, and say nothing where it starts as a stone."""
-    return replace(as_paper("sampler_start", *names), sampler_rate=FROM_NOISE)
+    return as_paper("sampler_start", *names)
 
 
 ROWS: dict[str, tuple[str, Settings]] = {
     "fast": ("the preset", FAST),
     "critic": ("D starts from N(0,1)", as_paper("critic_start")),
-    "sampler": ("S starts from N(0,1)", as_paper("sampler_start")),
-    "slower-sampler": ("the same, at half the rate", from_noise()),
+    "sampler": ("S starts from N(0,1)", from_noise()),
     "octaves": ("the same, with 16 octaves", from_noise("octaves")),
     "octave-span": ("the same, octaves 2^i", from_noise("octave_span")),
     "orthogonal": ("the same, T_i from N(0,1)", from_noise("orthogonal_start")),
