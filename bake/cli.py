@@ -7,14 +7,15 @@ errors go to stderr, an error as one line.
 from __future__ import annotations
 
 import argparse
+import codecs
 import importlib
 import io
 import os
 import re
 import signal
 import sys
-import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from types import FrameType, ModuleType
 from typing import NoReturn
 
@@ -48,6 +49,7 @@ EXTRAS = {
     "pyvista": "view",
     "vtkmodules": "view",
 }
+WITH_AN_EXTRA = ("train", "export", "evaluate")  # of their name, and it brings all that they need
 DONE, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
@@ -62,7 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line. Returns the exit code."""
     arguments = _glue_negative(list(sys.argv[1:] if argv is None else argv))
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="surrogateescape")  # file names that are not UTF-8 leave as they came
+        codecs.register_error("as it came", _as_it_came)
+        sys.stdout.reconfigure(errors="as it came")
     try:
         return _run(arguments)
     except KeyboardInterrupt:
@@ -74,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: list[str]) -> int:
     """The command, and one line for each kind of error."""
-    if threading.current_thread() is threading.main_thread():
+    with suppress(ValueError):  # in another thread than the one that signals interrupt
         signal.signal(signal.SIGTERM, _interrupt)  # farms stop jobs with SIGTERM: clean up as for Ctrl-C
     try:
         parser, module = _parser(arguments)
@@ -124,6 +127,15 @@ def _parser(arguments: Sequence[str]) -> tuple[Parser, ModuleType | None]:
     return parser, module
 
 
+def _as_it_came(error: UnicodeError) -> tuple[bytes, int]:
+    """Bytes of file names that are no text leave as they came; what the terminal's encoding lacks is escaped."""
+    assert isinstance(error, UnicodeEncodeError)
+    try:
+        return error.object[error.start : error.end].encode("ascii", "surrogateescape"), error.end
+    except UnicodeEncodeError:
+        return error.object[error.start : error.end].encode("ascii", "backslashreplace"), error.end
+
+
 def _called(arguments: Sequence[str]) -> str | None:
     """The command that is called."""
     return next((word for word in arguments if not word.startswith("-")), None)
@@ -145,7 +157,8 @@ def _missing(error: ModuleNotFoundError, command: str | None) -> int:
     package = (error.name or "").split(".")[0]
     if package not in EXTRAS:
         raise error
-    return _fail(f"{command} needs the package {package}; pip install 'solidgrain[{EXTRAS[package]}]'")
+    extra = command if command in WITH_AN_EXTRA else EXTRAS[package]
+    return _fail(f"{command} needs the package {package}; pip install 'solidgrain[{extra}]'")
 
 
 def _fail(message: str) -> int:

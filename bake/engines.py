@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 from solidgrain.bake.writers import Output, Volume
 from solidgrain.bake.writers.atlas import Layout, layout
+from solidgrain.bake.writers.table import BLOCKS
 from solidgrain.runtime.errors import UsageError
 
 VOLUME_SIDE, IMAGE_SIDE = 2048, 16384
@@ -66,7 +67,7 @@ def check_engine(engine: str, output: Output, volume: Volume) -> None:
                 f"--for {engine}: {output.path} has {extent} voxels along its {axis}, {preset.name} takes at most {most} in a "
                 "volume texture; bake fewer"
             )
-    if engine == "unreal" and output.options.get("type") in ("bc1", "bc7"):
+    if engine == "unreal" and output.options.get("type") in BLOCKS:
         raise UsageError(
             f"--for unreal: {output.path} is {output.options['type']}, Unreal imports no block-compressed DDS; use "
             "--dds-type rgba8, Unreal compresses it itself"

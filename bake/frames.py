@@ -10,6 +10,11 @@ from solidgrain.runtime.errors import UsageError
 PATTERN = re.compile(r"(?P<hashes>#+)|%0(?P<digits>\d\d?)d")
 
 
+def in_hashes(pattern: Path) -> Path:
+    """The same frames by one name: `a.%04d.exr` is `a.####.exr`."""
+    return pattern.with_name(PATTERN.sub(lambda match: match["hashes"] or "#" * max(1, int(match["digits"])), pattern.name))
+
+
 def frame_paths(pattern: Path, count: int, first: int) -> list[Path]:
     """The path of each of `count` frames, numbered from `first`.
 

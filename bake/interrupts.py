@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import signal
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import Any
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
     """Ctrl-C and SIGTERM wait until this is left, if this is the thread that they interrupt."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     waiting: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    handlers = [signal.signal(number, lambda number, frame: waiting.append(number)) for number in numbers]
+    former: dict[int, Any] = {}
+    with suppress(ValueError):  # not the thread that they interrupt, whatever `threading` takes for the main one
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if (
+                signal.getsignal(number) is not None
+            ):  # an application around Python handles it, and Python could not put it back
+                former[number] = signal.signal(number, lambda received, frame: waiting.append(received))
     try:
         yield
     finally:
-        for number, handler in zip(numbers, handlers, strict=True):
-            signal.signal(number, handler)
+        for handled, handler in former.items():
+            signal.signal(handled, handler)
         if waiting:
             signal.raise_signal(waiting[0])

@@ -131,9 +131,10 @@ def _flag(parser: JobParser, key: str, value: Any) -> list[str]:
     """A key and its value as words of a command line."""
     if key not in parser.keys:
         close = difflib.get_close_matches(key, [*parser.keys, *OWN], 1)
-        raise UsageError(
-            f"unknown key {key!r}" + (f"; did you mean {close[0]}?" if close else ", expected a flag of solidgrain bake")
-        )
+        advice = f"; did you mean {close[0]}?" if close else ", expected a flag of solidgrain bake"
+        if key in WORK:
+            advice = f": how all jobs are worked off is said beside --jobs, by --{key.replace('_', '-')}"
+        raise UsageError(f"unknown key {key!r}{advice}")
     flag = f"--{key.replace('_', '-')}"
     if isinstance(value, bool):
         return [flag] if value else []
@@ -201,6 +202,8 @@ def with_settings(output: Output, job: Job) -> Output:
     given = output.options
     if job.arguments.colorspace is None:  # its own type may have colours of its own
         given = {key: value for key, value in given.items() if key not in ("colorspace", "colorconfig")}
+    if job.arguments.dither:  # which its own type may have a use for
+        given = {**given, "dither": 1}
     return checked_output(replace(output, options=given), f"out {output.path.name}", **own)
 
 

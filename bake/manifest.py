@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from solidgrain.bake.farm import seen_from
+from solidgrain.bake.frames import in_hashes
 from solidgrain.bake.plan import Plan, hash_of
 from solidgrain.bake.store import sha256_of
 from solidgrain.bake.writers import Output
@@ -20,14 +21,14 @@ STAGED = "manifest.json"
 
 def manifest_path(output: Path) -> Path:
     """`a.vti` -> `a.vti.bake.json`: a manifest of its own for every output."""
-    return output.with_name(f"{output.name}{SUFFIX}")
+    return output.with_name(f"{in_hashes(output).name}{SUFFIX}")
 
 
 def stage_manifest(plan: Plan, output: Output, files: list[dict[str, Any]], staging: Path) -> None:
     """Write, in the staging folder, that an output is complete. `files` have a name ("final"), "bytes" and "sha256"."""
     values = {
         "plan": seen_from(output.path.parent, plan).to_json(),
-        "output": output.path.name,
+        "output": in_hashes(output.path).name,
         "work": hash_of(plan.work(output)),
         "files": {file["final"]: {"bytes": file["bytes"], "sha256": file["sha256"]} for file in files},
     }
@@ -49,7 +50,7 @@ def forget_manifest(output: Output) -> dict[str, Any]:
         manifest = {"output": "", "files": {}}
     path.unlink(missing_ok=True)
     files: dict[str, Any] = manifest["files"]
-    return files if manifest["output"] == output.path.name else {}
+    return files if manifest["output"] == in_hashes(output.path).name else {}
 
 
 def remove_stale(replaced: dict[str, Any], output: Output, files: list[dict[str, Any]]) -> None:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from solidgrain.bake.frames import in_hashes
 from solidgrain.bake.writers import Output, Volume
 from solidgrain.runtime.bundle import MANIFEST
 
@@ -90,7 +91,8 @@ class Plan:
         values = self.to_json()
         for key in ("hash", "outputs", "source", "bundle"):
             del values[key]
-        return {**values, "slab": self.slab, "bytes": BYTES_VERSION, "output": {**asdict(output), "path": output.path.name}}
+        named = {**asdict(output), "path": in_hashes(output.path).name}
+        return {**values, "slab": self.slab, "bytes": BYTES_VERSION, "output": named}
 
     def to_json(self) -> dict[str, Any]:
         """The plan as plain data, with the hash that names the work."""

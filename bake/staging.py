@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from solidgrain.bake.farm import seen_from
+from solidgrain.bake.frames import in_hashes
 from solidgrain.bake.plan import Plan, hash_of
 from solidgrain.bake.store import Encoded, Finished, Record, Span, Store, sha256_of
 from solidgrain.runtime.errors import BakeError
@@ -39,6 +40,7 @@ class Staging(Store):
         self.work = work  # hash of what the bytes depend on
         self.shared = shard is not None
         self.in_place = False  # files have begun to get their names
+        self._cleared = False
         self._locks = locks
         self._journal = folder / f"{JOURNAL}.{self.first:09d}"
 
@@ -148,6 +150,9 @@ class Staging(Store):
         """Let others work here."""
         for lock in self._locks:
             lock.close()
+        if self._cleared:  # on NFS an open file that is removed keeps its folder from being
+            with suppress(OSError):
+                self.folder.rmdir()
 
     def empty(self) -> None:
         """Remove everything but the locks: first what tells of bytes, last whose they are. A kill leaves nothing to believe."""
@@ -159,6 +164,7 @@ class Staging(Store):
 
     def clear(self) -> None:
         """Remove the folder, the lock last: whoever waits for it finds a folder that is gone, and begins a new one."""
+        self._cleared = True
         with suppress(OSError):
             self.empty()
             for path in sorted(self.folder.glob("*"), key=lambda path: path.name == LOCK):
@@ -173,7 +179,7 @@ def _removal(path: Path) -> int:
 
 
 def staging_folder(output: Path) -> Path:
-    return output.with_name(f".{output.name}.baking")
+    return output.with_name(f".{in_hashes(output).name}.baking")
 
 
 def is_begun(output: Path) -> bool:

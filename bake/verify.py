@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.bake.color import from_srgb, to_linear, to_srgb
+from solidgrain.bake.frames import in_hashes
 from solidgrain.bake.manifest import SUFFIX, damaged_files, manifest_path, read_manifest
 from solidgrain.bake.plan import Plan, hash_of
 from solidgrain.bake.schema import plan_of, seen_in
@@ -69,7 +70,7 @@ def _planned(manifest: dict[str, Any], path: Path) -> tuple[Plan, Output]:
     """The plan of a manifest, and its output where the manifest lies now."""
     plan = seen_in(path.parent, plan_of(manifest["plan"], str(path), "plan"))
     for output in plan.outputs:
-        if output.path.name == manifest["output"] and hash_of(plan.work(output)) == manifest["work"]:
+        if in_hashes(output.path).name == manifest["output"] and hash_of(plan.work(output)) == manifest["work"]:
             return plan, replace(output, path=path.parent / output.path.name)
     raise BakeError(f"{path}: was edited, its plan is not the one of its files; bake again with --overwrite")
 

@@ -1,12 +1,12 @@
 """The runtime: load a texture, evaluate it anywhere in space. Needs numpy and onnxruntime, nothing else.
 
-    from solidgrain.runtime import load
+    from solidgrain.runtime import load_space, load_texture
 
-    texture = load("granite")                       # an embedded name, a bundle folder, or a saved texture file
+    texture = load_texture("granite")               # an embedded name, a bundle folder, or a saved texture file
     rgb = texture.sample(points, seed=7)            # points [P, 3] (x, y, z) in exemplar pixels -> [P, 3]
     volume = texture.grid((64, 128, 128), seed=7)   # (z, y, x) voxels -> [64, 128, 128, 3]
 
-    space = load("stone")                           # a bundle with an encoder
+    space = load_space("stone")                     # a bundle with an encoder
     texture = space.encode(exemplar)                # [H, W, 3] float32 in [0, 1] or uint8
     wall = space.blend_along(texture, other, "z", 0, 96)    # one below, the other above
 

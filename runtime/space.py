@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,7 @@ from solidgrain.runtime.bundle import ENCODER, MAPPING, Bundle, bundle_folder, o
 from solidgrain.runtime.errors import BundleError, ExemplarError
 from solidgrain.runtime.mask import Mask, Vector, make_mask, make_ramp
 from solidgrain.runtime.provider import open_session
-from solidgrain.runtime.texture import Texture, make_workers, open_texture
+from solidgrain.runtime.texture import Numbers, Texture, make_workers, open_texture
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.runtime.workers import Workers
 
@@ -123,8 +122,8 @@ class Space:
         first: Texture,
         second: Texture,
         mask: npt.ArrayLike,
-        origin: Sequence[float] = (0.0, 0.0, 0.0),
-        spacing: float | Sequence[float] = 1.0,
+        origin: Numbers = (0.0, 0.0, 0.0),
+        spacing: float | Numbers = 1.0,
         name: str = "",
     ) -> Texture:
         """A texture that is the first where a mask [z, y, x] is 0, the second where it is 1, and between them in between.
@@ -203,7 +202,7 @@ def _pixels(exemplar: npt.ArrayLike, smallest: int) -> FloatArray:
     return pixels
 
 
-def _triple(values: float | Sequence[float]) -> Vector:
+def _triple(values: float | Numbers) -> Vector:
     """Three numbers (x, y, z), or one for all of them; NaN for what is neither."""
     try:
         x, y, z = np.broadcast_to(np.asarray(values, np.float64), 3).tolist()

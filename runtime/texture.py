@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,8 @@ from solidgrain.runtime.workers import Workers
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
+Numbers = Sequence[float] | npt.NDArray[np.number[Any]]
+Whole = Sequence[int] | npt.NDArray[np.integer[Any]]
 
 DEFAULT_TEXTURE = "granite"
 SLAB = 16  # slices per slab
@@ -50,7 +52,8 @@ def load_texture(
     machine or bundle (`Texture.provider` and `provider_note` say which and why); "kernel" insists; "cpu", "cuda",
     "directml", "coreml", "openvino" are ONNX Runtime's execution providers. One that cannot be had is an error. `precision`
     "bfloat16" is faster where the processor has AMX or AVX-512 BF16, and an error elsewhere. `threads` of 0 uses every
-    processor that this process may use. Raises BundleError or ProviderError; for a space, which is no texture, BundleError.
+    processor that this process may use. Raises BundleError, ProviderError, or EvaluationError for a number of threads that is
+    none; for a space, which is no texture, BundleError.
     """
     data, owner = _resolve(os.fspath(source), None if bundle is None else os.fspath(bundle))
     return open_texture(data, owner, provider, precision, make_workers(threads))
@@ -164,7 +167,7 @@ class Texture:
         """T_i [n, 3, 3], noise texels per exemplar pixel; of a blend in space, both textures' [2n, 3, 3]."""
         return self.data.transforms
 
-    def sample(self, points: npt.ArrayLike, seed: int = 0) -> FloatArray:
+    def sample(self, points: npt.ArrayLike, seed: SupportsIndex = 0) -> FloatArray:
         """Colour at points [P, 3] (x, y, z) in exemplar pixels -> [P, 3] float32 in [0, 1], sRGB-encoded.
 
         A point that is NaN, infinite or beyond 2^36 pixels has the colour NaN, and a RuntimeWarning counts them. Raises
@@ -193,13 +196,13 @@ class Texture:
 
     def grid(
         self,
-        shape: Sequence[int],
-        seed: int = 0,
+        shape: Whole,
+        seed: SupportsIndex = 0,
         *,
-        origin: Sequence[float] = (0.0, 0.0, 0.0),
-        spacing: float | Sequence[float] = 1.0,
+        origin: Numbers = (0.0, 0.0, 0.0),
+        spacing: float | Numbers = 1.0,
         tile: str = "",
-        period: Sequence[int] | None = None,
+        period: Whole | None = None,
         transform: npt.ArrayLike | None = None,
     ) -> FloatArray:
         """Colour on a voxel grid of shape (z, y, x) -> [z, y, x, 3] float32 in [0, 1], sRGB-encoded.
@@ -210,20 +213,24 @@ class Texture:
         at p has the colour of M p, column vectors (x, y, z, 1). Raises EvaluationError for a shape, spacing, period,
         origin or transform that makes no sense.
         """
-        volume = np.empty((*_positive("shape", shape), 3), np.float32)
-        for z, slab in self.slabs(shape, seed, origin=origin, spacing=spacing, tile=tile, period=period, transform=transform):
+        slabs = self.slabs(shape, seed, origin=origin, spacing=spacing, tile=tile, period=period, transform=transform)
+        try:
+            volume = np.empty((*_positive("shape", shape), 3), np.float32)
+        except ValueError as error:
+            raise EvaluationError(f"shape {shape}: more than any array holds; take slabs() instead") from error
+        for z, slab in slabs:
             volume[z : z + len(slab)] = slab
         return volume
 
     def slabs(
         self,
-        shape: Sequence[int],
-        seed: int = 0,
+        shape: Whole,
+        seed: SupportsIndex = 0,
         *,
-        origin: Sequence[float] = (0.0, 0.0, 0.0),
-        spacing: float | Sequence[float] = 1.0,
+        origin: Numbers = (0.0, 0.0, 0.0),
+        spacing: float | Numbers = 1.0,
         tile: str = "",
-        period: Sequence[int] | None = None,
+        period: Whole | None = None,
         transform: npt.ArrayLike | None = None,
         slab: int = SLAB,
         slices: tuple[int, int] | None = None,
@@ -250,12 +257,12 @@ class Texture:
 
     def grid_start(
         self,
-        shape: Sequence[int],
+        shape: Whole,
         *,
-        origin: Sequence[float] = (0.0, 0.0, 0.0),
-        spacing: float | Sequence[float] = 1.0,
+        origin: Numbers = (0.0, 0.0, 0.0),
+        spacing: float | Numbers = 1.0,
         tile: str = "",
-        period: Sequence[int] | None = None,
+        period: Whole | None = None,
         transform: npt.ArrayLike | None = None,
     ) -> Vector:
         """The corner of a grid (x, y, z), the shift of its transform included: M p + t = M (p + start - origin).
@@ -283,11 +290,11 @@ class Texture:
 
     def tiling(
         self,
-        shape: Sequence[int],
+        shape: Whole,
         *,
-        spacing: float | Sequence[float] = 1.0,
+        spacing: float | Numbers = 1.0,
         tile: str = "",
-        period: Sequence[int] | None = None,
+        period: Whole | None = None,
         transform: npt.ArrayLike | None = None,
     ) -> Tiling:
         """How tiling moves this texture's transforms for such a grid, and by how much (`distortion`)."""
@@ -309,7 +316,7 @@ class Texture:
         else:
             write_texture(Path(path), self.data)
 
-    def _instance(self, tiling: Tiling, seed: int) -> Instance:
+    def _instance(self, tiling: Tiling, seed: SupportsIndex) -> Instance:
         """The instance of a seed; the last one is kept, so that point after point is cheap."""
         try:
             number = operator.index(seed)
@@ -322,11 +329,11 @@ class Texture:
         return last[1]
 
 
-def _positive(name: str, values: Sequence[int]) -> tuple[int, ...]:
+def _positive(name: str, values: Whole) -> tuple[int, ...]:
     return _whole(name, values, count=3, least=1)
 
 
-def _whole(name: str, values: Sequence[int], count: int, least: int) -> tuple[int, ...]:
+def _whole(name: str, values: Whole, count: int, least: int) -> tuple[int, ...]:
     try:
         numbers = tuple(operator.index(value) for value in values)
     except TypeError:
@@ -338,7 +345,7 @@ def _whole(name: str, values: Sequence[int], count: int, least: int) -> tuple[in
     return numbers
 
 
-def _finite(name: str, values: Sequence[float]) -> Vector:
+def _finite(name: str, values: Numbers) -> Vector:
     try:
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError):
@@ -362,8 +369,12 @@ def _affine(transform: npt.ArrayLike | None) -> DoubleArray:
     return matrix
 
 
-def _spacing(spacing: float | Sequence[float]) -> Vector:
-    step = _finite("spacing", (spacing,) * 3 if np.ndim(spacing) == 0 else spacing)  # type: ignore[arg-type]
+def _spacing(spacing: float | Numbers) -> Vector:
+    try:
+        alone = np.ndim(spacing) == 0
+    except ValueError:  # neither a number nor three
+        alone = False
+    step = _finite("spacing", (spacing,) * 3 if alone else spacing)  # type: ignore[arg-type]
     if min(step) < FINEST or max(step) > FARTHEST:
         raise EvaluationError(f"spacing {step}: expected {FINEST:g} to {FARTHEST:g} exemplar pixels per voxel")
     return step

@@ -7,7 +7,7 @@ import importlib.util
 import json
 import os
 import platform
-from importlib.metadata import PackageNotFoundError, distributions, version
+from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from typing import Any
 
 PACKAGES = (
@@ -41,7 +41,7 @@ def diagnose() -> dict[str, Any]:
         "providers": _providers(problems),
         "textures": _textures(problems),
         "opengl": _opengl(),
-        "problems": problems,
+        "problems": list(dict.fromkeys(problems)),  # one cause is met by many textures
     }
 
 
@@ -54,8 +54,7 @@ def _version(name: str) -> str | None:
 
 def _onnxruntime_builds(problems: list[str]) -> list[str]:
     """Installed builds of ONNX Runtime. Two of them overwrite each other's files, and the CPU build usually wins."""
-    names = (str(found.metadata["Name"]) for found in distributions())
-    builds = sorted({name for name in names if name.lower().startswith("onnxruntime")})
+    builds = sorted(set(packages_distributions().get("onnxruntime", [])))
     if len(builds) > 1:
         problems.append(f"{' and '.join(builds)} are installed together; uninstall all of them, then install one")
     return builds

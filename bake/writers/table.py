@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from solidgrain.bake.color import LINEAR, SRGB, color_options
@@ -98,7 +98,8 @@ def make_output(path: Path, kind: str = "", /, **options: str | int) -> Output:
     if options.get("mips", "") not in ("", *FILTERS):
         raise UsageError(f"{path}: mips {options['mips']!r}, expected one of {', '.join(FILTERS)}")
     filled = known | {name: value for name, value in options.items() if value != ""}
-    return Output(path, kind, filled | color_options(str(filled["colorspace"]), str(filled["colorconfig"])))
+    output = Output(path, kind, filled | color_options(str(filled["colorspace"]), str(filled["colorconfig"])))
+    return output if rounds(output) else replace(output, options={**output.options, "dither": 0})
 
 
 def _check_axes(path: Path, axes: str) -> None:
@@ -182,4 +183,10 @@ def clips(output: Output) -> bool:
     return str(output.options.get("type", "uint8" if output.kind == ".atlas.png" else "float")) in WHOLE_NUMBERS
 
 
+def rounds(output: Output) -> bool:
+    """Whether its colours become whole numbers, blocks of them included: what dither is for."""
+    return clips(output) or output.options.get("type") in BLOCKS
+
+
+BLOCKS = ("bc1", "bc7")
 WHOLE_NUMBERS = ("uint8", "uint16", "rgba8")

@@ -226,10 +226,55 @@ def test_doctor_finds_two_builds_of_onnx_runtime(solidgrain, tmp_path, monkeypat
     package = tmp_path / "onnxruntime_gpu-1.0.dist-info"
     package.mkdir()
     (package / "METADATA").write_text("Metadata-Version: 2.1\nName: onnxruntime-gpu\nVersion: 1.0\n")
+    (package / "top_level.txt").write_text("onnxruntime\n")
     monkeypatch.syspath_prepend(tmp_path)
     outcome = solidgrain("doctor")
     assert outcome.code == 1
     assert "onnxruntime and onnxruntime-gpu are installed together" in outcome.out
+
+
+def test_doctor_tells_an_extension_of_onnx_runtime_from_a_build(solidgrain, tmp_path, monkeypatch):
+    package = tmp_path / "onnxruntime_extensions-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: onnxruntime-extensions\nVersion: 1.0\n")
+    (package / "top_level.txt").write_text("onnxruntime_extensions\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert json.loads(solidgrain("doctor", "--json").out)["onnxruntime_builds"] == ["onnxruntime"]
+
+
+def test_one_cause_is_one_problem(solidgrain, monkeypatch):
+    monkeypatch.setenv("SOLIDGRAIN_KERNEL", "bogus")
+    problems = json.loads(solidgrain("doctor", "--json").out)["problems"]
+    assert problems
+    assert len(problems) == len(set(problems))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_terminal_that_lacks_a_character_gets_it_escaped(encoding):
+    command = [sys.executable, "-m", "solidgrain.bake.cli", "bake", "--help"]
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    outcome = subprocess.run(command, capture_output=True, env=environment, check=False)
+    assert outcome.returncode == 0, outcome.stderr
+    assert b"\\u2026" in outcome.stdout
+
+
+@pytest.mark.parametrize(
+    ("command", "flags", "extra"),
+    [
+        ("export", ["run", "--out", "b"], "export"),
+        ("evaluate", ["granite", "--exemplar", "a.png"], "evaluate"),
+        ("adapt", ["a.png", "--out", "a.sgt.npz"], "train"),
+    ],
+)
+def test_the_extra_that_is_named_is_all_that_a_command_needs(command, flags, extra):
+    outcome = without("torch", command, *flags)
+    assert outcome.stderr.strip().endswith(f"{command} needs the package torch; pip install 'solidgrain[{extra}]'")
+
+
+def test_an_unknown_flag_points_to_the_help_of_its_command(solidgrain):
+    outcome = solidgrain("bake", "--nope")
+    assert outcome.code == 2
+    assert outcome.err.endswith("solidgrain bake: unrecognized arguments: --nope (see solidgrain bake --help)\n")
 
 
 def without(package: str, *arguments: object) -> subprocess.CompletedProcess[str]:

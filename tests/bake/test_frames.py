@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from solidgrain.bake.frames import frame_paths
+from solidgrain.bake.frames import frame_paths, in_hashes
 from solidgrain.runtime import UsageError
 
 
@@ -19,6 +19,13 @@ from solidgrain.runtime import UsageError
 )
 def test_patterns(pattern, count, first, names):
     assert [path.name for path in frame_paths(Path("x") / pattern, count, first)] == names
+
+
+@pytest.mark.parametrize(
+    ("pattern", "name"), [("a.%04d.exr", "a.####.exr"), ("a_%02d", "a_##"), ("a.###.exr", "a.###.exr"), ("a%d.vti", "a%d.vti")]
+)
+def test_one_stack_has_one_name(pattern, name):
+    assert in_hashes(Path("x") / pattern) == Path("x") / name
 
 
 @pytest.mark.parametrize("pattern", ["a.exr", "a.##.%02d.exr"])

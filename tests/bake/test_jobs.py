@@ -141,6 +141,28 @@ def test_an_output_may_be_for_no_engine(write_jobs):
     assert (plain.options["engine"], plain.options["axes"]) == ("", "+x+y+z")
 
 
+def test_whole_numbers_of_an_output_may_be_written_as_json_may(write_jobs):
+    (own,) = outputs_of(write_jobs({"name": "a", "out": {"path": "a.####.exr", "start": 5.0}}))
+    assert own.options["start"] == 5
+    (dithered,) = outputs_of(write_jobs({"name": "a", "out": {"path": "a.vti", "dither": True}}))
+    assert dithered.options["dither"] == 1
+
+
+def test_dither_is_for_whole_numbers_and_changes_no_other_plan(write_jobs):
+    outs = ["a.####.exr", {"path": "b.vti", "type": "float32"}, {"path": "c.dds", "type": "bc7"}, "d.vti", "e.atlas.png"]
+    found = outputs_of(write_jobs({"name": "a", "out": outs, "dither": True}))
+    assert [output.options["dither"] for output in found] == [0, 0, 1, 1, 1]
+    (own,) = outputs_of(
+        write_jobs({"name": "a", "out": {"path": "a.vti", "type": "uint8"}, "dither": True, "vti_type": "float32"})
+    )
+    assert own.options["dither"] == 1
+
+
+def test_flags_about_the_work_are_for_the_command_line(solidgrain, write_jobs):
+    path = write_jobs({"name": "a", "out": "a.npy", "threads": 1})
+    assert "how all jobs are worked off is said beside --jobs, by --threads" in solidgrain("bake", "--jobs", path).error
+
+
 def test_whole_numbers_may_be_written_as_floats(solidgrain, write_jobs, tmp_path):
     path = write_jobs({"name": "a", "out": "a.npy"}, size=4.0, seed=7.0)
     assert solidgrain("bake", "--jobs", path, "--quiet").code == 0

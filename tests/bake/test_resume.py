@@ -11,6 +11,7 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import pytest
 from solidgrain.bake import report as report_module
 from solidgrain.bake import staging as staging_module
 from solidgrain.bake.baker import bake, merge
+from solidgrain.bake.interrupts import uninterrupted
 from solidgrain.bake.schema import load_plan
 from solidgrain.bake.staging import is_begun, open_staging, staged_bytes, staging_folder
 from solidgrain.bake.writers import PREVIEW, make_output
@@ -238,6 +240,53 @@ def test_a_smaller_bake_leaves_no_slices_of_the_one_that_it_replaces(solidgrain,
         flags = ("--size", f"4x4x{depth}", "--out", tmp_path / "a.##.exr", "--overwrite", "--quiet")
         assert solidgrain("bake", toy_folder, *flags).code == 0
     assert [path.name for path in sorted(tmp_path.glob("a.*.exr"))] == [f"a.{k:02d}.exr" for k in range(1, 6)]
+
+
+def test_two_spellings_of_a_frame_pattern_are_one_output(solidgrain, tmp_path, toy_folder):
+    def run(command, name, *flags):
+        outcome = solidgrain(command, *(() if command != "bake" else (toy_folder, "--out")), tmp_path / name, *flags)
+        assert outcome.code == 0, outcome.err
+
+    run("bake", "a.####.exr", "--size", "4x4x6")
+    run("bake", "a.%04d.exr", "--size", "4x4x3", "--overwrite")
+    assert {path.name for path in tmp_path.iterdir()} == {*(f"a.000{k}.exr" for k in (1, 2, 3)), "a.####.exr.bake.json"}
+    for name in ("a.####.exr", "a.%04d.exr"):
+        run("verify", name)
+    run("bake", "b.####.exr", "--size", "4x4x20", "--shard", "1/2")
+    run("bake", "b.%04d.exr", "--size", "4x4x20", "--shard", "2/2")
+    run("merge", "b.%04d.exr")
+    run("verify", "b.####.exr")
+
+
+def test_a_folder_that_an_open_lock_keeps_is_removed_after_it(tmp_path, monkeypatch):
+    """NFS gives an open file that is removed another name until it is closed."""
+    staging = open_staging(tmp_path / "a.npy", {}, 4, 0, None, fresh=True)
+    (lock,), other = staging._locks, staging.folder / ".nfs0001"
+
+    def unlink(path, missing_ok=False, real=Path.unlink):
+        return path.rename(other) if path.name == "lock" else real(path, missing_ok=missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", unlink)
+    staging._locks = [SimpleNamespace(close=lambda: (lock.close(), other.unlink()))]
+    staging.clear()
+    assert list(staging.folder.iterdir()) == [other]
+    staging.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("known", "raised"), [(None, False), (signal.SIG_DFL, True)], ids=["of a host", "in another thread"])
+def test_handlers_that_are_not_pythons_stay(monkeypatch, known, raised):
+    """Applications that embed Python have handlers in C, or call it in a thread that `threading` takes for the main one."""
+
+    def refuse(number, handler):
+        if raised:
+            raise ValueError("signal only works in main thread of the main interpreter")
+        raise AssertionError("replaced")
+
+    monkeypatch.setattr(signal, "getsignal", lambda number: known)
+    monkeypatch.setattr(signal, "signal", refuse)
+    with uninterrupted():
+        pass
 
 
 def test_replacing_files_can_be_resumed(solidgrain, tmp_path, toy, toy_folder):

@@ -190,6 +190,10 @@ def test_colours_are_clipped_to_the_unit_range(toy_folder, tmp_path):
         (lambda t: t.grid((1, 1, 1), tile="x", period=(0, 1, 1)), "period"),
         (lambda t: t.slabs((1, 1, 1), slab=0), "slab"),
         (lambda t: t.grid((1, 1, 1), seed=-1), "seed"),
+        (lambda t: t.grid((600, 2000, 2000), tile="w"), "tile"),
+        (lambda t: t.grid((2**40,) * 3), "shape|pixels"),
+        (lambda t: t.grid((2**22,) * 3, spacing=1e-3), r"take slabs\(\) instead"),
+        (lambda t: t.grid((1, 1, 1), spacing=[1, [2, 3], 1]), "spacing"),
     ],
 )
 def test_arguments_that_make_no_sense_are_refused_with_their_name(toy, call, message):
