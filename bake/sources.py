@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -82,6 +83,8 @@ def check_new(file: Path, overwrite: bool) -> None:
         raise UsageError(f"--out {file}: no folder {file.parent}; make it first")
     if file.exists() and not overwrite:
         raise BakeError(f"{file}: already exists; choose another --out, or --overwrite")
+    if not os.access(file.parent, os.W_OK):
+        raise BakeError(f"{file}: folder {file.parent} is not writable")
 
 
 class Encoded:

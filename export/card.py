@@ -68,5 +68,7 @@ def _names(names: list[str]) -> str:
 
 
 def with_quality(card: str, table: str) -> str:
-    """The card with its quality section written anew."""
-    return card.split(QUALITY, maxsplit=1)[0].rstrip() + f"\n\n{QUALITY}\n\n{table.rstrip()}\n"
+    """The card with its quality section written anew, in its place, or at the end."""
+    before, _, rest = card.partition(f"\n{QUALITY}\n")
+    _, heading, after = rest.partition("\n## ")
+    return f"{before.rstrip()}\n\n{QUALITY}\n\n{table.rstrip()}\n{heading}{after}"

@@ -40,6 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     from solidgrain.export.evaluation import exemplar_scale, grain_of, measure, write_quality
     from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load_texture
+    from solidgrain.runtime.blend_file import BlendData
     from solidgrain.runtime.provider import usable_threads
     from solidgrain.train.inception import Inception
     from solidgrain.train.photograph import read_exemplar
@@ -51,6 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
     torch.set_num_threads(arguments.threads or usable_threads())
     inception = Inception(arguments.inception) if arguments.inception else None
     texture = load_texture(arguments.source, bundle=arguments.bundle, threads=arguments.threads)
+    if isinstance(texture.data, BlendData):
+        raise UsageError(f"{arguments.source}: is a blend in space, which has no exemplar of its own; evaluate its ends")
     if arguments.card and texture.bundle.is_space:
         raise UsageError(f"--card: {texture.bundle.name} is a space, its card not that of one texture; leave --card out")
     scale = arguments.patch_scale or exemplar_scale(texture)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,8 @@ def trained_state(run: RunFolder) -> dict[str, Any]:
         )
     state = run.load_checkpoint()
     if state is None:
-        raise TrainingError(f"{run.folder}: no checkpoint yet; let solidgrain train --resume {run.folder} go on for a while")
+        resume = f"solidgrain train --resume {shlex.quote(str(run.folder))}"
+        raise TrainingError(f"{run.folder}: no checkpoint yet; let {resume} go on for a while")
     return state
 
 

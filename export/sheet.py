@@ -7,16 +7,13 @@ pictures inside. The same texture and exemplar give the same bytes.
 from __future__ import annotations
 
 import base64
-import struct
 import textwrap
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -26,8 +23,7 @@ from solidgrain.runtime.files import replacing
 from solidgrain.train.copying import Pair
 from solidgrain.train.cuts import Sample, axis_rotation, oblique_rotation, take_slices
 from solidgrain.train.exemplar import FloatArray
-
-Pixels = npt.NDArray[np.uint8]  # [H, W, 3]
+from solidgrain.train.preview import Pixels, as_png
 
 PANEL = 256  # pixels along each side of a picture: at most of the exemplar, at least on the sheet
 ENLARGED = 6  # screen pixels per pixel of a patch
@@ -116,17 +112,6 @@ def as_html(sheet: Sheet) -> str:
     body.append(f"<p>{escape(figures.after)}</p>")
     head = f'<meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
     return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n' + "\n".join(body) + "\n</body></html>\n"
-
-
-def as_png(pixels: Pixels) -> bytes:
-    """An 8-bit RGB image as the bytes of a PNG file (PNG specification, third edition), the same ones every time."""
-    height, width = pixels.shape[:2]
-    lines = np.zeros((height, 1 + 3 * width), np.uint8)  # each line begins with its filter: 0, none
-    lines[:, 1:] = pixels.reshape(height, -1)
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"sRGB", b"\0"), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b""))
-    framed = [struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(framed)
 
 
 def _drawn(sheet: Sheet) -> Pixels:

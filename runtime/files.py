@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -21,6 +22,13 @@ LARGE = 2**31 - 2**20  # bytes: from here on, an archive's member needs 64-bit s
 def temporary_name(path: Path) -> Path:
     """A hidden name beside the file that nobody else has, with the same suffix. Processes in containers share numbers."""
     return path.with_name(f".{path.stem}.{os.urandom(8).hex()}.tmp{path.suffix}")
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Remove the files under such names that kills have left in a folder of which this process is the only owner."""
+    for path in folder.glob(".*.tmp*"):
+        if re.fullmatch(r"\..*\.[0-9a-f]{16}\.tmp(\.[^.]*)?", path.name) and path.is_file():
+            path.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -172,7 +172,7 @@ class Space:
         for key, value in between.arrays().items():
             left = [end.arrays()[key] - of_code.arrays()[key] for end, of_code in zip(ends, mapped, strict=True)]
             arrays[key] = (value + (1 - at) * left[0] + at * left[1]).astype(value.dtype)
-        return replace(between, **arrays)
+        return replace(between, **arrays, scale=first.scale ** (1 - at) * second.scale**at)
 
 
 def _graph(bundle: Bundle, name: str, inputs: list[str], outputs: list[str]) -> onnxruntime.InferenceSession:

@@ -32,6 +32,7 @@ from solidgrain.train.losses import gram_difference, mean_gram, mean_grams
 from solidgrain.train.noise import Noise, draw_noise, look_up
 from solidgrain.train.settings import Budget, Settings
 from solidgrain.train.slices import UNIT, draw_slices
+from solidgrain.train.streams import MEASURE, stream
 from solidgrain.train.vgg import Vgg
 
 FloatArray = npt.NDArray[np.float32]
@@ -164,7 +165,7 @@ class Adaptation:
         self.start, self.sampler, self.features, self.recipe = start, sampler, features, recipe
         self.settings = replace(settings, octaves=len(start.transforms))
         self.reduced_precision = use_bfloat16(settings, device)
-        self.generator = torch.Generator(device).manual_seed(settings.seed)
+        self.generator = stream(device, settings.seed)
         self.sizes = np.linalg.norm(start.transforms, axis=(1, 2), keepdims=True) / math.sqrt(3)  # [n, 1, 1]
         self.octave_scale = torch.tensor(self.sizes * UNIT, dtype=torch.float32, device=device)
         owned = (start.transforms / self.sizes, start.gamma, start.delta, start.noise_weights)
@@ -225,7 +226,7 @@ class Adaptation:
     @torch.no_grad()
     def measure(self, theta: Theta) -> float:
         """L_style over many slices, the same ones whenever it is called."""
-        generator = torch.Generator(self.generator.device).manual_seed((self.settings.seed + 1) % 2**64)
+        generator = stream(self.generator.device, self.settings.seed, MEASURE)
         noise = draw_noise(self.settings.octaves, self.settings.resolution, generator)
         return float(torch.stack([self._style(theta, noise, generator) for _ in range(self.recipe.measured)]).mean())
 

@@ -107,17 +107,18 @@ def run(arguments: argparse.Namespace) -> int:
             return FAILED
         except KeyboardInterrupt:
             if processes.first:
-                tell_of_interruption(arguments.resume or arguments.out)
+                tell_of_interruption(arguments)
             return INTERRUPTED
 
 
-def tell_of_interruption(folder: Path) -> None:
+def tell_of_interruption(arguments: argparse.Namespace) -> None:
     """Of a training that was not left the time to save."""
     from solidgrain.train.run import OPTIONS
 
+    folder: Path = arguments.resume or arguments.out
     if not (folder / OPTIONS).exists():
         raise KeyboardInterrupt  # nothing to speak of was begun
-    resume = f"solidgrain train --resume {shlex.quote(str(folder))}"
+    resume = f"solidgrain train --resume {shlex.quote(str(folder))}{budget_flags(arguments)}"
     tell(f"interrupted; go on from its last checkpoint with: {resume}")
 
 
@@ -138,8 +139,7 @@ def train_on(training: RunFolder, arguments: argparse.Namespace, device: torch.d
     stopped = processes.any(stop.requested())
     progress.end()
     if processes.first:
-        flags = budget_flags(arguments) if arguments.resume else ""  # which the run's own budget does not know
-        tell(how_to_go_on(training, stopped, ending, flags))
+        tell(how_to_go_on(training, stopped, ending, budget_flags(arguments)))
     return INTERRUPTED if stopped else 0
 
 
@@ -166,7 +166,9 @@ def how_to_go_on(training: RunFolder, stopped: bool, ending: Ending, flags: str)
 
 
 def budget_flags(arguments: argparse.Namespace) -> str:
-    """The budget as it was given, to be given again."""
+    """The budget as it was given, to be given again, where the run's own does not know it."""
+    if not arguments.resume:
+        return ""
     counts = (("--iterations", arguments.iterations), ("--minutes", arguments.minutes))
     given = "".join(f" {flag} {count}" for flag, count in counts if count is not None)
     return given + " --until-plateau" * bool(arguments.until_plateau)

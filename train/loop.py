@@ -9,7 +9,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -21,6 +20,7 @@ from solidgrain.train.preview import write_preview
 from solidgrain.train.processes import Processes
 from solidgrain.train.run import CHECKPOINT, PARTS, Run, RunFolder
 from solidgrain.train.settings import Budget, Settings, rate
+from solidgrain.train.streams import narrowed, stream
 from solidgrain.train.task import Batch, Colors, Inputs, make_task
 from solidgrain.train.watch import SETTLING, Watch, flaw
 
@@ -55,7 +55,7 @@ class Trainer:
     def __init__(self, run: RunFolder, device: torch.device, processes: Processes = ALONE) -> None:
         self.run, self.settings, self.device, self.processes = run, run.settings, device, processes
         self.task = make_task(run, device)
-        self.generator = torch.Generator(device).manual_seed(self.settings.seed)
+        self.generator = stream(device, self.settings.seed)
         critic = first_critic(self.settings, self.generator)
         self.critic = critic.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.judge = make_judge(self.settings, self.critic, device)
@@ -242,8 +242,7 @@ class Trainer:
 
     def _draw_anew(self, *numbers: int) -> None:
         """Another random stream, a function of the run's seed and these numbers."""
-        stream = np.random.SeedSequence([self.settings.seed, *numbers])
-        self.generator.manual_seed(int(stream.generate_state(1, np.uint64)[0] >> 1))
+        self.generator.manual_seed(narrowed(self.settings.seed, *numbers))
 
     @torch.no_grad()
     def flaw(self) -> str:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import os
+import struct
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from solidgrain.runtime.errors import TrainingError
-from solidgrain.runtime.files import temporary_name
+from solidgrain.runtime.files import replacing
 from solidgrain.train.exemplar import FloatArray, middle
 from solidgrain.train.noise import draw_noise
 from solidgrain.train.settings import Settings
 from solidgrain.train.slices import flat_slice, from_quaternions
 
 Model = Callable[..., Tensor]  # noise, points and what else it needs -> colours
+
+Pixels = npt.NDArray[np.uint8]  # [H, W, 3]
 
 SIZE = 256  # pixels along each side of a slice
 
@@ -55,15 +59,23 @@ def write_preview(
 
 
 def _write_png(path: Path, image: FloatArray) -> None:
-    import OpenImageIO as oiio
-
-    temporary = temporary_name(path)
-    buffer = oiio.ImageBuf(np.ascontiguousarray(image))
+    pixels = (image.clip(0, 1) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
     try:
-        written = buffer.write(os.fspath(temporary), oiio.UINT8)
-        reader = oiio.ImageInput.open(os.fspath(temporary)) if written else None
-        if reader is None or reader.read_image(oiio.UINT8) is None:  # only reading it back shows that the disk was full
-            raise TrainingError(f"{path}: cannot write the sample; make space and go on with --resume")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        path.parent.mkdir(exist_ok=True)
+        with replacing(path) as file:
+            file.write(as_png(pixels))
+    except OSError as error:
+        raise TrainingError(
+            f"{path}: cannot write the sample ({error.strerror}); see that it can be, and go on with --resume"
+        ) from error
+
+
+def as_png(pixels: Pixels) -> bytes:
+    """An 8-bit RGB image as the bytes of a PNG file (PNG specification, third edition), the same ones every time."""
+    height, width = pixels.shape[:2]
+    lines = np.zeros((height, 1 + 3 * width), np.uint8)  # each line begins with its filter: 0, none
+    lines[:, 1:] = pixels.reshape(height, -1)
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"sRGB", b"\0"), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b""))
+    framed = [struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(framed)

@@ -15,8 +15,10 @@ Images here are tensors [1, 3, H, W] in [0, 1].
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -71,7 +73,7 @@ def evaluate(
     measure = Measure(inception)
     image = as_image(exemplar)
     size = min(image.shape[2] // 2, image.shape[3] // 2, LARGEST_CROP)
-    squares = spread_out(distinct(disjoint_crops(image, size)), COMPARED)
+    squares = [square.pixels for square in spread_out(distinct(disjoint_crops(image, size)), COMPARED)]
     crops = [measure.statistics(square) for square in squares]
     floor = _mean(measure.distances(a, b) for i, a in enumerate(crops) for b in crops[:i])
     if floor["color"] < SMALLEST_FLOOR:
@@ -105,16 +107,28 @@ def turned_as_slices_are(image: Tensor, grain: str) -> Tensor:
     return image.rot90(1, (2, 3)) if grain == "none" else image.flip(2 if grain == "x" else 3)
 
 
-def disjoint_crops(image: Tensor, size: int) -> list[Tensor]:
-    """The image [1, 3, H, W] cut into squares, from the top left."""
-    rows, columns = (range(0, extent - size + 1, size) for extent in image.shape[2:])
-    return [image[..., top : top + size, left : left + size] for top in rows for left in columns]
+class Square(NamedTuple):
+    """A part of a picture, and which one of its grid of parts it is."""
+
+    pixels: Tensor  # [1, 3, size, size]
+    row: int
+    column: int
 
 
-def distinct(squares: list[Tensor]) -> list[Tensor]:
+def disjoint_crops(image: Tensor, size: int) -> list[Square]:
+    """The image [1, 3, H, W] cut into squares; what is left over is shared out among its edges."""
+    rows, columns = ([extent % size // 2 + number * size for number in range(extent // size)] for extent in image.shape[2:])
+    return [
+        Square(image[..., top : top + size, left : left + size], row, column)
+        for row, top in enumerate(rows)
+        for column, left in enumerate(columns)
+    ]
+
+
+def distinct(squares: list[Square]) -> list[Square]:
     """Without those that repeat an earlier one, as where a photograph holds two periods: a floor is not between equals."""
-    step = max(1, squares[0].shape[2] // 32)
-    seen = torch.cat([square[..., ::step, ::step].flatten(1) for square in squares])
+    step = max(1, squares[0].pixels.shape[2] // 32)
+    seen = torch.cat([square.pixels[..., ::step, ::step].flatten(1) for square in squares])
     apart = torch.cdist(seen, seen, p=1)
     typical = apart[torch.ones_like(apart).triu(1).bool()].median()
     kept: list[int] = []
@@ -124,9 +138,17 @@ def distinct(squares: list[Tensor]) -> list[Tensor]:
     return [squares[number] for number in kept]
 
 
-def spread_out(squares: list[Tensor], count: int) -> list[Tensor]:
-    """At most so many of a picture's squares, evenly along their order: from its top to its bottom, not below each other."""
-    return [squares[round(k)] for k in np.linspace(0, len(squares) - 1, min(count, len(squares)))]
+def spread_out(squares: list[Square], count: int) -> list[Square]:
+    """At most so many of a picture's squares: each as far from those before it as can be, the first in a corner."""
+    chosen: list[Square] = []
+
+    def apart(square: Square) -> tuple[float, int, int]:
+        near = min((math.dist(square[1:], other[1:]) for other in chosen), default=0.0)
+        return near, -square.row, square.column
+
+    for _ in range(min(count, len(squares))):
+        chosen.append(max(squares, key=apart))
+    return chosen
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import shlex
 import shutil
 import subprocess
 from collections.abc import Collection, Iterator, Sequence
@@ -26,7 +27,7 @@ import numpy as np
 import torch
 
 from solidgrain.runtime.errors import TrainingError
-from solidgrain.runtime.files import locked, replacing
+from solidgrain.runtime.files import locked, remove_temporaries, replacing
 from solidgrain.train import settings as settings_module
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.packing import pack, unpack
@@ -96,7 +97,7 @@ class RunFolder:
         except OSError as error:
             raise TrainingError(
                 f"{self.folder / name}: cannot write ({error.strerror}); the last checkpoint is whole: "
-                f"make space and go on with --resume {self.folder}"
+                f"make space and go on with --resume {shlex.quote(str(self.folder))}"
             ) from error
 
 
@@ -172,6 +173,8 @@ def held(folder: Path) -> Iterator[None]:
         raise TrainingError(f"{folder}: cannot write the run directory ({error.strerror})") from error
     with lock:
         try:
+            for ours in (folder, folder / SAMPLES) if (folder / OPTIONS).exists() else ():
+                remove_temporaries(ours)
             yield
         finally:
             (folder / LOCK).unlink(missing_ok=True)
@@ -185,7 +188,8 @@ def creating(folder: Path) -> Iterator[None]:
     Whatever goes wrong inside, nothing half-made is left behind.
     """
     if (folder / OPTIONS).exists():
-        raise TrainingError(f"{folder}: already holds a run; continue it with --resume {folder}, or choose another --out")
+        quoted = shlex.quote(str(folder))
+        raise TrainingError(f"{folder}: already holds a run; continue it with --resume {quoted}, or choose another --out")
     for path in (folder / name for name in CONTENTS):  # a checkpoint would be taken up, as this run's own
         if path.is_file() or (path.is_dir() and any(path.iterdir())):
             raise TrainingError(f"{path}: is there already, without a run; remove it or choose another --out")

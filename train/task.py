@@ -22,6 +22,7 @@ from solidgrain.train.settings import Settings
 from solidgrain.train.slices import draw_slices, scatter
 from solidgrain.train.space import Space
 from solidgrain.train.space_run import SpaceRun
+from solidgrain.train.streams import TABLES, stream
 
 PLACES = 4096  # at which an average is looked at
 COLOR_PLACES = 1024  # places whose colours are compared: costlier than in a slice, for no two share a texel
@@ -79,8 +80,7 @@ class Instances:
 
     def __init__(self, settings: Settings, device: torch.device) -> None:
         self.settings = settings
-        own = torch.Generator(device).manual_seed((settings.seed + 1) % 2**64)
-        self.shared = self._fresh(own) if settings.shared_noise else None
+        self.shared = self._fresh(stream(device, settings.seed, TABLES)) if settings.shared_noise else None
 
     def draw(self, generator: torch.Generator) -> Noise:
         return self._fresh(generator) if self.shared is None else self.shared.moved(generator)

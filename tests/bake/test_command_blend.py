@@ -69,6 +69,13 @@ def test_a_sequence_goes_from_the_first_texture_to_the_second(blend, space, text
     assert report["textures"][4]["texture_sha256"] == textures[1].data.sha256
 
 
+def test_a_blend_is_at_a_scale_between_those_of_its_ends(space, textures):
+    halved, quartered = (space.open(replace(one.data, scale=scale)) for one, scale in zip(textures, (2.0, 4.0), strict=True))
+    assert space.blend(halved, quartered, 0.5).data.scale == pytest.approx(8**0.5)
+    assert space.blend(halved, quartered, 1).data.scale == 4
+    assert space.blend(*textures, 0.5).data.sha256 == space.blend(halved, quartered, 0.5).data.sha256
+
+
 def test_steps_of_tenths_are_tenths(blend, space, textures, tmp_path):
     outcome = blend("--at", "1:0:-0.1", "--out", tmp_path / "ab.%02d.sgt.npz", "--json")
     assert [one["at"] for one in json.loads(outcome.out)["textures"]] == [1, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0]

@@ -256,6 +256,12 @@ def test_bad_input_is_one_line_and_leaves_nothing(solidgrain, toy_space_folder, 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_that_nothing_can_be_written_to_is_named_before_any_work(solidgrain, photograph, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    outcome = solidgrain("encode", photograph, "--out", tmp_path / "a.sgt.npz")
+    assert (outcome.code, outcome.error) == (1, f"solidgrain: {tmp_path / 'a.sgt.npz'}: folder {tmp_path} is not writable")
+
+
 def test_a_photograph_that_is_none_is_one_line(solidgrain, toy_space_folder, tmp_path):
     (tmp_path / "broken.png").write_bytes(b"no picture")
     out = tmp_path / "out.sgt.npz"

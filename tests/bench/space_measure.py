@@ -47,7 +47,7 @@ def cut_crops(photograph: Tensor, patch: int) -> Crops:
     corners = [(y, x) for y in range(0, height - patch + 1, patch) for x in range(0, width - patch + 1, patch)]
     apart = [(y, x) for y, x in corners if abs(y - top) >= patch or abs(x - left) >= patch]
     if len(apart) < FEWEST:
-        crops = disjoint_crops(photograph, min(height // 2, width // 2, patch))
+        crops = [square.pixels for square in disjoint_crops(photograph, min(height // 2, width // 2, patch))]
         return Crops(crops, crops, same=True)
     order = torch.randperm(len(apart), generator=torch.Generator().manual_seed(0)).tolist()
     places = [(top, left), *(apart[k] for k in order[:MOST])]

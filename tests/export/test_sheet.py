@@ -19,10 +19,11 @@ pytest.importorskip(
 import OpenImageIO as oiio
 
 from solidgrain.export.figures import Figures
-from solidgrain.export.sheet import aligned, as_html, as_png, make_sheet, write_sheet
+from solidgrain.export.sheet import aligned, as_html, make_sheet, write_sheet
 from solidgrain.runtime import load_texture
 from solidgrain.runtime.errors import SolidgrainError
 from solidgrain.train.copying import Pair
+from solidgrain.train.preview import as_png
 from tests.train.conftest import blotches
 
 EXEMPLAR = blotches(80, 96)

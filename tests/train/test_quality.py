@@ -117,8 +117,10 @@ def test_the_command_measures_a_bundle_and_writes_its_card(solidgrain, toy_folde
     assert "| vgg_frechet |" in outcome.out
     assert outcome.out.strip() in (folder / "card.md").read_text()
     assert "Copying: patches are" in outcome.out
+    (folder / "card.md").write_text((folder / "card.md").read_text() + "\n## Usage\n\nFor floors.\n")
     solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
     assert (folder / "card.md").read_text().count("## Quality") == 1
+    assert (folder / "card.md").read_text().endswith("\n\n## Usage\n\nFor floors.\n")
     (folder / "card.md").write_bytes(b"caf\xe9")
     outcome = solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
     assert outcome.code == 1
@@ -147,6 +149,17 @@ def test_a_photograph_that_is_too_small_to_measure_by_is_refused_with_flags_that
     assert outcome.error.endswith(
         "100x100 pixels, expected at least 128x128; use a larger photograph or a smaller --patch-scale"
     )
+
+
+def test_a_blend_in_space_has_no_exemplar(solidgrain, toy_space_folder, tmp_path):
+    space = load_space(toy_space_folder)
+    ends = [space.encode(picture) for picture in (blotches(128, 128), blotches(150, 128))]
+    space.blend_along(*ends, "x", 0, 64).save(tmp_path / "ab.sgt.npz")
+    cells.write_png(tmp_path / "a.png", blotches(128, 128))
+    flags = ("--bundle", toy_space_folder, "--exemplar", tmp_path / "a.png", "--slices", 1)
+    outcome = solidgrain("evaluate", tmp_path / "ab.sgt.npz", *flags)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert "ab.sgt.npz: is a blend in space, which has no exemplar of its own; evaluate its ends" in outcome.error
 
 
 def test_a_card_is_not_that_of_one_texture_of_a_space(solidgrain, toy_space_folder, tmp_path):
@@ -185,9 +198,20 @@ def test_an_exemplar_that_changes_across_itself_is_said_to():
 def test_crops_of_a_large_exemplar_are_all_over_it():
     image = torch.arange(16.0).reshape(4, 4).kron(torch.ones(8, 8))[None, None]
     squares = spread_out(disjoint_crops(image, 8), 6)
-    rows, columns = zip(*(divmod(int(square.mean()), 4) for square in squares), strict=True)
-    assert set(rows) == set(columns) == {0, 1, 2, 3}
+    assert all(divmod(int(square.pixels.mean()), 4) == (square.row, square.column) for square in squares)
+    for side in 3, 4, 5, 10:
+        rows, columns = zip(
+            *(square[1:] for square in spread_out(disjoint_crops(torch.zeros(1, 1, side, side), 1), 6)), strict=True
+        )
+        assert {0, side - 1} < set(rows) and {0, side - 1} < set(columns)
     assert len(spread_out(disjoint_crops(image[..., :16, :16], 8), 6)) == 4
+
+
+def test_what_no_square_has_room_for_is_left_at_all_edges_alike():
+    image = torch.arange(20.0).expand(1, 3, 20, 20)
+    (first, *_), last = squares = disjoint_crops(image, 8), disjoint_crops(image, 8)[-1]
+    assert (first.pixels[0, 0, 0, 0], last.pixels[0, 0, -1, -1]) == (2, 17)
+    assert len(squares[0]) == 4
 
 
 def test_crops_that_repeat_each_other_count_once():
@@ -196,7 +220,7 @@ def test_crops_that_repeat_each_other_count_once():
     twice = torch.cat([image, image + 0.002], dim=3)  # two periods, a level apart
     left = distinct(disjoint_crops(twice, 64))
     assert len(left) == len(squares) == 4
-    assert all(torch.equal(a, b) for a, b in zip(left, squares, strict=True))
+    assert all(torch.equal(a.pixels, b.pixels) for a, b in zip(left, squares, strict=True))
     assert len(distinct(squares)) == 4
     assert len(distinct(disjoint_crops(torch.tile(image[..., :64, :64], (2, 2)), 64))) == 4  # no two differ: evaluate says so
 
@@ -205,7 +229,7 @@ def test_of_a_gradient_there_are_always_crops_to_compare():
     ramp = torch.linspace(0, 1, 64 * 50).expand(1, 3, 64, -1)  # each crop is near the one before it
     left = distinct(disjoint_crops(ramp, 64))
     assert 2 <= len(left) < 50
-    assert left[0].mean() < left[-1].mean() - 0.5
+    assert left[0].pixels.mean() < left[-1].pixels.mean() - 0.5
 
 
 def test_inception_weights_that_are_missing_are_noticed_before_measuring(solidgrain, toy_folder, tmp_path):

@@ -20,13 +20,15 @@ from solidgrain.export.evaluation import scale_of
 from solidgrain.export.from_run import check_agreement, export_run, sampler_weights
 from solidgrain.runtime import BundleError, TrainingError, load
 from solidgrain.runtime.bundle import open_bundle
+from solidgrain.runtime.files import temporary_name
 from solidgrain.train import command, loop
 from solidgrain.train import run as run_module
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.photograph import read_exemplar
-from solidgrain.train.run import Source, create_run, open_run, pixels_sha256
+from solidgrain.train.run import Source, create_run, held, open_run, pixels_sha256
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import Budget, preset
+from solidgrain.train.streams import stream
 from solidgrain.train.task import SingleExemplar, make_task
 from tests.train.conftest import blotches
 
@@ -205,6 +207,33 @@ def test_two_processes_cannot_train_the_same_run(tmp_path, photograph, solidgrai
     assert not (folder / "lock").exists()
     numbers = [line["iteration"] for line in losses(folder)]
     assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_what_kills_have_left_is_removed_when_the_run_goes_on(tmp_path, photograph, solidgrain):
+    folder = tmp_path / "run"
+    run = new_run(folder, photograph)
+    left = [temporary_name(folder / name) for name in ("checkpoint.pt", "stats.jsonl", "samples/000004.png")]
+    mine = [folder / ".notes.tmp", folder / ".0123456789abcdef.tmp.pt", tmp_path / temporary_name(folder).name]
+    for path in (*left, *mine):
+        path.touch()
+    with held(run.folder):
+        assert not any(path.exists() for path in left)
+        assert all(path.exists() for path in mine)
+
+
+def test_samples_have_a_folder_again_and_any_name(tmp_path, photograph):
+    run = new_run(tmp_path / os.fsdecode(b"run\xff"), photograph)
+    (run.folder / "samples").rmdir()
+    train(run, Budget(iterations=1), CPU)
+    assert [path.name for path in (run.folder / "samples").iterdir()] == ["000001.png"]
+
+
+def test_every_seed_is_another_training():
+    seeds = ((0,), (1,), (2**32,), (2**32 + 1,), (2**64 - 1,), (0, 1), (1, 1), (0, 1, 1), (2**32, 1))
+    streams = [stream(CPU, *numbers) for numbers in seeds]
+    assert len({int(torch.randint(2**62, (), generator=one)) for one in streams}) == len(streams)
+    again, plain = stream(CPU, 7), torch.Generator().manual_seed(7)
+    assert torch.equal(torch.randn(9, generator=again), torch.randn(9, generator=plain))
 
 
 @pytest.mark.parametrize("name", ["checkpoint.pt", "exemplar.npy", "samples/000500.png"])
