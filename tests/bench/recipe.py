@@ -1,6 +1,6 @@
 """`make recipe-table`: what each departure of the `fast` preset from the paper is worth, by quality over time.
 
-python -m tests.bench.recipe --marks 2,4,6 --threads 1 --out FOLDER [--only ROW] [--exemplar PHOTO] [--resume]
+python -m tests.bench.recipe --marks 2,4,6 --out FOLDER [--only ROW] [--exemplar PHOTO] [--set NAME=VALUE] [--resume]
 
 Each row is the preset with one setting, or one group of them, as the paper has it. Every row is trained on the same exemplars
 with the same seeds, and measured after so many minutes of training, or with `--by iterations` at the same iterations on any
@@ -89,11 +89,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     chosen = arguments.exemplar if arguments.exemplar or arguments.anisotropic else DEFAULTS
     exemplars = {path.stem: middle(path, arguments.largest) for path in chosen}
     grained = {path.stem: middle(path, arguments.largest) for path in arguments.anisotropic}
-    device, _ = cells.prepare(arguments, marks=arguments.marks, by=arguments.by, largest=arguments.largest)
+    changes = dict(arguments.set)
+    asked = {"marks": arguments.marks, "by": arguments.by, "largest": arguments.largest} | ({"set": changes} if changes else {})
+    device, _ = cells.prepare(arguments, **asked)
     for seed in range(arguments.seeds):
         for row in arguments.only or ROWS:
             for name, exemplar in (exemplars | grained).items():
-                settings = replace(ROWS[row][1], seed=seed)
+                settings = replace(ROWS[row][1], seed=seed, **changes)
                 settings = with_grain(settings, "auto" if name in grained else None, exemplar)
                 folder = arguments.out / row / f"{name}-{seed}"
                 for mark in arguments.marks:
@@ -112,6 +114,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--exemplar", action="append", type=Path, default=[], metavar="PHOTO", help="instead of the three; may be repeated")
     add("--anisotropic", action="append", type=Path, default=[], metavar="PHOTO", help="another one, with a grain")
     add("--largest", type=parse_positive, default=LARGEST, metavar="PX", help=f"of larger photographs the middle ({LARGEST})")
+    add(
+        "--set", type=parse_setting, action="append", default=[], metavar="NAME=VALUE", help="of train/settings.py, in all rows"
+    )
     arguments = parser.parse_args(argv)
     if arguments.by == "iterations" and any(mark % 1 for mark in arguments.marks):
         raise UsageError(f"--marks {','.join(f'{mark:g}' for mark in arguments.marks)}: expected whole numbers of iterations")
@@ -120,6 +125,17 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 def parse_marks(text: str) -> list[float]:
     return sorted(parse_minutes(mark) for mark in text.split(","))
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """A setting and its value, of the type that it has in the preset."""
+    name, _, value = text.partition("=")
+    preset = asdict(FAST)
+    try:
+        kind = type(preset[name])
+        return name, {"true": True, "false": False}[value] if kind is bool else kind(value)
+    except (KeyError, ValueError):
+        raise argparse.ArgumentTypeError(f"expected a setting of train/settings.py and its value, found {text!r}") from None
 
 
 def middle(path: Path, largest: int) -> FloatArray:

@@ -105,3 +105,17 @@ def test_photographs_with_a_grain_take_the_place_of_the_three_too(small, tmp_pat
     found = json.loads((tmp_path / "out" / "table.json").read_text())["fast"]
     assert [cell["exemplar"] for cell in found.values()] == ["blotches-0", "blotches-0"]
     assert all(cell["settings"]["grain"] != "none" for cell in found.values())
+
+
+def test_a_setting_may_be_another_one_in_all_rows(small, tmp_path, capsys):
+    flags = [*("2" if flag == "0.01,0.02" else flag for flag in small), "--by", "iterations"]
+    recipe.main([*flags, "--set", "sampler_rate=8e-3", "--set", "gram_energy=false"])
+    for cell in json.loads((tmp_path / "out" / "table.json").read_text()).values():
+        (settings,) = (one["settings"] for one in cell.values())
+        assert (settings["sampler_rate"], settings["gram_energy"]) == (8e-3, False)
+    assert cells.reported(lambda: recipe.main([*flags, "--resume"])) == 2
+    assert "was started with other set" in capsys.readouterr().err
+    for wrong in ("sampler_rat=1", "sampler_rate=fast", "gram_energy=1", "alpha"):
+        with pytest.raises(SystemExit):
+            recipe.parse(["--set", wrong])
+        assert f"expected a setting of train/settings.py and its value, found '{wrong}'" in capsys.readouterr().err
