@@ -85,9 +85,8 @@ def _run(arguments: list[str]) -> int:
         return _missing(error, _called(arguments))
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
-        Parser(prog=" ".join(["solidgrain", *filter(None, [options.command])])).error(
-            f"unrecognized arguments: {' '.join(unknown)}"
-        )
+        program = f"solidgrain {options.command}" if options.command else "solidgrain"
+        Parser(prog=program).error(f"unrecognized arguments: {' '.join(unknown)}")
     if module is None:
         parser.print_help()
         return USAGE

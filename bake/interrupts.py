@@ -15,9 +15,8 @@ def uninterrupted() -> Iterator[None]:
     former: dict[int, Any] = {}
     with suppress(ValueError):  # not the thread that they interrupt, whatever `threading` takes for the main one
         for number in (signal.SIGINT, signal.SIGTERM):
-            if (
-                signal.getsignal(number) is not None
-            ):  # an application around Python handles it, and Python could not put it back
+            # None: an application around Python handles it, in a way that Python could not put back
+            if signal.getsignal(number) is not None:
                 former[number] = signal.signal(number, lambda received, frame: waiting.append(received))
     try:
         yield
