@@ -183,8 +183,8 @@ class Trainer:
 
     @torch.no_grad()
     def _update_average(self) -> None:
-        """Exponential moving average of the weights; its memory grows to half of the training so far."""
-        keep = min(self.settings.average_decay, (1 + self.iteration) / (3 + self.iteration))
+        """Exponential moving average of the weights; its memory grows to a ninth of the training so far."""
+        keep = min(self.settings.average_decay, (1 + self.iteration) / (10 + self.iteration))
         for average, current in zip(self.average.parameters(), self.sampler.parameters(), strict=True):
             average.lerp_(current, 1 - keep)
 
