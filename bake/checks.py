@@ -26,7 +26,7 @@ def check_plan(plan: Plan, overwrite: bool, begun: Sequence[Output] = (), shard:
     """
     for output in plan.outputs:
         check_output(output, plan.volume)
-        _check_folder(output.path)
+        check_folder(output.path)
         _check_text(output)
     _check_memory(plan)  # before any list as long as the volume is made
     _check_disk(plan, shard)
@@ -101,7 +101,7 @@ def _check_text(output: Output) -> None:
         raise BakeError(f"{output.path}: the name is not UTF-8, with which OpenImageIO writes no file; rename it") from error
 
 
-def _check_folder(path: Path) -> None:
+def check_folder(path: Path) -> None:
     folder = path.parent
     if not folder.is_dir():
         raise BakeError(f"{path}: folder {folder} does not exist; create it first")

@@ -155,21 +155,28 @@ def make_plan(arguments: argparse.Namespace, texture: Texture) -> Plan:
 
 def make_outputs(arguments: argparse.Namespace) -> list[Output]:
     """The files that the flags name, by absolute paths, with the settings of their formats."""
-    from solidgrain.bake.writers import PREVIEW, formats, kind_of, make_output
+    from solidgrain.bake.writers import PREVIEW, kind_of, make_output
 
     _check_uses(arguments)
     outputs = []
     for path in arguments.out:
         kind = kind_of(path)
-        row = formats()[kind]
-        flags = {option.name: getattr(arguments, f"{row.name}_{option.name}".replace("-", "_")) for option in row.options}
-        given = {name: value for name, value in flags.items() if value is not None}
-        outputs.append(make_output(path.absolute(), kind, **_shared_options(arguments, kind), **given))
+        outputs.append(make_output(path.absolute(), kind, **asked_options(arguments, kind)))
     if arguments.preview:
         if arguments.preview.suffix.lower() != ".png":
             raise UsageError(f"--preview {arguments.preview}: expected a name that ends in .png")
         outputs.append(make_output(arguments.preview.absolute(), PREVIEW))
     return outputs
+
+
+def asked_options(arguments: argparse.Namespace, kind: str) -> dict[str, str | int]:
+    """What the flags say of a file of this kind, without what they leave to its format."""
+    from solidgrain.bake.writers import formats
+
+    row = formats()[kind]
+    flags = {option.name: getattr(arguments, f"{row.name}_{option.name}".replace("-", "_")) for option in row.options}
+    given = {name: value for name, value in flags.items() if value is not None}
+    return {**_shared_options(arguments, kind), **given}
 
 
 def unused(paths: Iterable[Path]) -> dict[str, str]:

@@ -142,11 +142,13 @@ def _flag(parser: JobParser, key: str, value: Any) -> list[str]:
 
 
 def _flat(value: Any) -> Iterator[Any]:
+    from solidgrain.bake.schema import whole
+
     if isinstance(value, list):
         for part in value:
             yield from _flat(part)
     else:
-        yield int(value) if isinstance(value, float) and value.is_integer() else value  # JSON does not tell 64 from 64.0
+        yield whole(value)
 
 
 def _source(name: str | None, folder: Path) -> str | None:
@@ -193,18 +195,16 @@ def plan_jobs(
 def with_settings(output: Output, job: Job) -> Output:
     """One of a job's outputs, with what the job says of it alone. Raises UsageError."""
     from solidgrain.bake.engines import axes_for
+    from solidgrain.bake.flags import asked_options
     from solidgrain.bake.schema import checked_output
+    from solidgrain.bake.writers import PREVIEW
     from solidgrain.bake.writers.orient import UPRIGHT
 
     own = {"engine" if key == "for" else key: value for key, value in job.settings.get(output.path, {}).items()}
     if "engine" in own and "axes" not in own:
         own["axes"] = axes_for(str(own["engine"]), output.kind) if own["engine"] else UPRIGHT
-    given = output.options
-    if job.arguments.colorspace is None:  # its own type may have colours of its own
-        given = {key: value for key, value in given.items() if key not in ("colorspace", "colorconfig")}
-    if job.arguments.dither:  # which its own type may have a use for
-        given = {**given, "dither": 1}
-    return checked_output(replace(output, options=given), f"out {output.path.name}", **own)
+    asked = {} if output.kind == PREVIEW else asked_options(job.arguments, output.kind)  # its type decides what the others are
+    return checked_output(replace(output, options=asked), f"out {output.path.name}", **own)
 
 
 def _check_names(planned: Sequence[Planned]) -> None:

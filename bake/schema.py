@@ -60,7 +60,7 @@ def plan_of(values: Any, where: str, place: str = "") -> Plan:
     return replace(plan, outputs=tuple(outputs))
 
 
-def _whole(value: Any) -> Any:
+def whole(value: Any) -> Any:
     """Neither JSON's 5.0 nor its true is more than a whole number here."""
     return int(value) if isinstance(value, bool) or (isinstance(value, float) and value.is_integer()) else value
 
@@ -83,7 +83,7 @@ def checked_output(output: Output, where: str, /, **options: str | int) -> Outpu
     suffix = ".png" if output.kind == PREVIEW else output.kind
     if not output.path.name.lower().endswith(suffix):
         raise UsageError(f"{where}.path: expected a name that ends in {suffix}, found {_shown(str(output.path))}")
-    options = {key: _whole(value) for key, value in {**output.options, **options}.items()}
+    options = {key: whole(value) for key, value in {**output.options, **options}.items()}
     known = make_output(output.path, output.kind)
     for name in sorted(set(options) & set(known.options)):
         expected = type(known.options[name])

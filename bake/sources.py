@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -76,15 +75,16 @@ def encode_photograph(space: Space, path: Path, cut: Cut = WHERE_IT_IS, on_note:
 
 
 def check_new(file: Path, overwrite: bool) -> None:
-    """Raises UsageError for a name that is no texture file's, BakeError for a file that is there and is to stay."""
+    """Raises UsageError for a name that is no texture file's, BakeError for a file that is to stay, or cannot be written."""
+    from solidgrain.bake.checks import check_folder
+
     if not file.name.endswith(TEXTURE_SUFFIX):
         raise UsageError(f"--out {file}: expected a name that ends in {TEXTURE_SUFFIX}")
     if not file.parent.is_dir():
         raise UsageError(f"--out {file}: no folder {file.parent}; make it first")
     if file.exists() and not overwrite:
         raise BakeError(f"{file}: already exists; choose another --out, or --overwrite")
-    if not os.access(file.parent, os.W_OK):
-        raise BakeError(f"{file}: folder {file.parent} is not writable")
+    check_folder(file)
 
 
 class Encoded:

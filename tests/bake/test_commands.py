@@ -222,23 +222,23 @@ def test_doctor_says_why_there_is_no_kernel(solidgrain, monkeypatch):
     assert "nowhere.so" in outcome.out
 
 
-def test_doctor_finds_two_builds_of_onnx_runtime(solidgrain, tmp_path, monkeypatch):
-    package = tmp_path / "onnxruntime_gpu-1.0.dist-info"
+def pretend_installed(folder, monkeypatch, name: str, module: str) -> None:
+    package = folder / f"{name.replace('-', '_')}-1.0.dist-info"
     package.mkdir()
-    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: onnxruntime-gpu\nVersion: 1.0\n")
-    (package / "top_level.txt").write_text("onnxruntime\n")
-    monkeypatch.syspath_prepend(tmp_path)
+    (package / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (package / "top_level.txt").write_text(f"{module}\n")
+    monkeypatch.syspath_prepend(folder)
+
+
+def test_doctor_finds_two_builds_of_onnx_runtime(solidgrain, tmp_path, monkeypatch):
+    pretend_installed(tmp_path, monkeypatch, "onnxruntime-gpu", module="onnxruntime")
     outcome = solidgrain("doctor")
     assert outcome.code == 1
     assert "onnxruntime and onnxruntime-gpu are installed together" in outcome.out
 
 
 def test_doctor_tells_an_extension_of_onnx_runtime_from_a_build(solidgrain, tmp_path, monkeypatch):
-    package = tmp_path / "onnxruntime_extensions-1.0.dist-info"
-    package.mkdir()
-    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: onnxruntime-extensions\nVersion: 1.0\n")
-    (package / "top_level.txt").write_text("onnxruntime_extensions\n")
-    monkeypatch.syspath_prepend(tmp_path)
+    pretend_installed(tmp_path, monkeypatch, "onnxruntime-extensions", module="onnxruntime_extensions")
     assert json.loads(solidgrain("doctor", "--json").out)["onnxruntime_builds"] == ["onnxruntime"]
 
 
