@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from solidgrain.bake.color import quantize
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.files import replacing
 from solidgrain.train.exemplar import FloatArray, middle
@@ -20,7 +21,6 @@ from solidgrain.train.settings import Settings
 from solidgrain.train.slices import flat_slice, from_quaternions
 
 Model = Callable[..., Tensor]  # noise, points and what else it needs -> colours
-
 Pixels = npt.NDArray[np.uint8]  # [H, W, 3]
 
 SIZE = 256  # pixels along each side of a slice
@@ -59,7 +59,7 @@ def write_preview(
 
 
 def _write_png(path: Path, image: FloatArray) -> None:
-    pixels = (image.clip(0, 1) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+    pixels = quantize(image, np.uint8).astype(np.uint8, copy=False)
     try:
         path.parent.mkdir(exist_ok=True)
         with replacing(path) as file:
