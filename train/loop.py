@@ -349,12 +349,15 @@ def is_octave(name: str) -> bool:
 
 
 def use_bfloat16(settings: Settings, device: torch.device) -> bool:
-    """Whether plain forward passes run in bfloat16: only where the processor multiplies it natively, unless told so."""
+    """Whether plain forward passes run in bfloat16: unless told so, only where that was measured to be faster.
+
+    Intel's AVX-512 BF16 alone, without AMX, trains a sixth slower than float32 (docs/training.md).
+    """
     if settings.precision != "auto":
         return settings.precision == "bfloat16"
     if device.type == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
-    return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
+    return bool(torch.cpu._is_amx_tile_supported())
 
 
 def _write_sample(trainer: Trainer) -> None:

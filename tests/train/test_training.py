@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -115,6 +116,16 @@ def test_resuming_is_exact_in_bfloat16_and_on_two_threads_as_well(tmp_path, phot
             train(open_run(tmp_path / name), Budget(iterations=iterations), CPU)
     assert losses(tmp_path / "parts") == losses(tmp_path / "whole")
     assert_same_checkpoint(tmp_path / "parts", tmp_path / "whole")
+
+
+def test_bfloat16_is_chosen_where_it_is_faster(monkeypatch):
+    """With AMX, not with AVX-512 BF16 alone, which does not multiply faster than float32; and where it was asked for."""
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    for amx in (True, False):
+        monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda amx=amx: amx)
+        assert loop.use_bfloat16(preset("fast"), CPU) is amx
+        for precision in ("float32", "bfloat16"):
+            assert loop.use_bfloat16(replace(preset("fast"), precision=precision), CPU) is (precision == "bfloat16")
 
 
 def test_later_patches_are_larger_where_the_exemplar_has_room(tmp_path, photograph):
