@@ -15,6 +15,7 @@ FloatArray = npt.NDArray[np.float32]
 
 SRGB = "srgb_rec709_scene"
 LINEAR = "lin_rec709_scene"
+LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # weights of Rec.709's red, green and blue (ITU-R BT.709)
 
 
 def color_options(colorspace: str, planned: str = "") -> dict[str, str | int]:

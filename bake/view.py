@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.color import LINEAR, SRGB, quantize, to_srgb
+from solidgrain.bake.color import LINEAR, LUMA, SRGB, quantize, to_srgb
 from solidgrain.bake.masks import DAMAGED_ARRAY
 from solidgrain.bake.messages import warn
 from solidgrain.bake.opengl import has_display, off_screen_environment, require_opengl
@@ -166,6 +166,5 @@ def _add(plotter: Any, image: pyvista.ImageData, mode: str, interactive: bool) -
 
 def luma(image: pyvista.ImageData) -> npt.NDArray[np.uint8]:
     """Rec.709 luma of the colours."""
-    weights = np.array([0.2126, 0.7152, 0.0722], np.float32)
-    values: npt.NDArray[np.uint8] = (np.asarray(image.point_data["rgb"]) @ weights).astype(np.uint8)
+    values: npt.NDArray[np.uint8] = (np.asarray(image.point_data["rgb"]) @ LUMA).astype(np.uint8)
     return values

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.color import LINEAR, SRGB, to_half, to_linear
+from solidgrain.bake.color import LINEAR, LUMA, SRGB, to_half, to_linear
 from solidgrain.bake.frames import frame_paths
 from solidgrain.bake.store import Encoded, Finished, Store
 from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
@@ -24,7 +24,6 @@ from solidgrain.bake.writers.exr_zip import LINES, deflated, isal_zlib
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.workers import Workers
 
-LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # relative luminance of linear Rec.709 (ITU-R BT.709)
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # xy of red, green, blue, white (ITU-R BT.709)
 HALF_LARGEST = np.float32(65504)
 SOURCES = ("r", "g", "b", "luma", "one")
