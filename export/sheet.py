@@ -118,7 +118,8 @@ def _drawn(sheet: Sheet) -> Pixels:
     """The sheet as one picture."""
     figures = sheet.figures
     table = aligned((figures.header, *figures.rows))
-    width = max(sum(picture.shape[1] + GAP for _, picture in row) for row in sheet.rows) + GAP
+    pictures = max(sum(picture.shape[1] + GAP for _, picture in row) for row in sheet.rows) + GAP
+    width = max(pictures, *(_letters_width(line, TABLE) + 2 * GAP for line in table))
     page = Page(width)
     page.write([sheet.title], LABELS)
     for row in sheet.rows[:2]:
@@ -131,6 +132,13 @@ def _drawn(sheet: Sheet) -> Pixels:
     page.write(table, TABLE)
     page.write(textwrap.wrap(figures.after, letters), LABELS)
     return page.pixels()
+
+
+def _letters_width(text: str, font: str) -> int:
+    """Screen pixels that a line of text takes."""
+    import OpenImageIO as oiio
+
+    return int(oiio.ImageBufAlgo.text_size(text, LETTER, font).width)
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

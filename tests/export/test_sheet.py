@@ -6,6 +6,7 @@ import base64
 import json
 import os
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -19,7 +20,7 @@ pytest.importorskip(
 import OpenImageIO as oiio
 
 from solidgrain.export.figures import Figures
-from solidgrain.export.sheet import aligned, as_html, make_sheet, write_sheet
+from solidgrain.export.sheet import GAP, aligned, as_html, make_sheet, write_sheet
 from solidgrain.runtime import load_texture
 from solidgrain.runtime.errors import SolidgrainError
 from solidgrain.train.copying import Pair
@@ -141,6 +142,15 @@ def test_the_picture_has_its_pictures_and_text_on_white(sheet, tmp_path):
     bottom = page[-60:]
     assert (bottom == 255).mean() > 0.8
     assert (bottom < 60).any()
+
+
+def test_a_page_is_as_wide_as_its_table(sheet, tmp_path):
+    """No column is cut off: a wider table ends as far from the page's edge."""
+    wide = Figures("", ("measure", "m" * 90, "last column"), [("gram", "0.5", "1.0")], "")
+    write_sheet(tmp_path / "sheet.png", replace(sheet, figures=wide))
+    page = pixels_of((tmp_path / "sheet.png").read_bytes(), tmp_path)
+    assert page.shape[1] > 110 * 8
+    assert (page[:, -GAP:] == 255).all()
 
 
 def test_a_sheet_that_cannot_be_written_is_one_line(sheet, tmp_path):
