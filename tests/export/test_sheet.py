@@ -146,10 +146,10 @@ def test_the_picture_has_its_pictures_and_text_on_white(sheet, tmp_path):
 
 def test_a_page_is_as_wide_as_its_table(sheet, tmp_path):
     """No column is cut off: a wider table ends as far from the page's edge."""
-    wide = Figures("", ("measure", "m" * 90, "last column"), [("gram", "0.5", "1.0")], "")
+    wide = Figures("", ("measure", "m" * 145, "last column"), [("gram", "0.5", "1.0")], "")
     write_sheet(tmp_path / "sheet.png", replace(sheet, figures=wide))
     page = pixels_of((tmp_path / "sheet.png").read_bytes(), tmp_path)
-    assert page.shape[1] > 110 * 8
+    assert page.shape[1] > 165 * 8
     assert (page[:, -GAP:] == 255).all()
 
 
