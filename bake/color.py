@@ -6,6 +6,8 @@ of the running OpenColorIO configuration (ocio.py).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +17,7 @@ FloatArray = npt.NDArray[np.float32]
 
 SRGB = "srgb_rec709_scene"
 LINEAR = "lin_rec709_scene"
+HALF_LARGEST = np.float32(65504)
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # weights of Rec.709's red, green and blue (ITU-R BT.709)
 
 
@@ -73,13 +76,19 @@ def to_half(values: FloatArray) -> npt.NDArray[np.float16]:
     """`values.astype(np.float16)`, bit for bit, in half the time where all of them are normal numbers of that type.
 
     Adding just under half of the last place that stays, and one more where that place is odd, rounds to the nearest even.
+    What the type has no number for becomes its largest, not infinity.
     """
-    if values.size == 0 or values.min() < 2.0**-14 or not values.max() < 65504:
-        return values.astype(np.float16)
+    if values.size == 0 or values.min() < 2.0**-14 or not values.max() < HALF_LARGEST:
+        return values.clip(-HALF_LARGEST, HALF_LARGEST).astype(np.float16)
     bits = np.ascontiguousarray(values).view(np.uint32)
     rounded = bits + (np.uint32(0xFFF) + ((bits >> np.uint32(13)) & np.uint32(1)))
     shifted = (rounded >> np.uint32(13)) - np.uint32((127 - 15) << 10)
     return shifted.astype(np.uint16).view(np.float16)
+
+
+def as_floats(values: FloatArray, dtype: npt.DTypeLike) -> npt.NDArray[np.floating[Any]]:
+    """Colours as half or single floats, contiguous."""
+    return to_half(values) if np.dtype(dtype).itemsize == 2 else np.ascontiguousarray(values, dtype)
 
 
 def quantize(rgb: FloatArray, dtype: npt.DTypeLike, noise: FloatArray | None = None) -> npt.NDArray[np.generic]:

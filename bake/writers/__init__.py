@@ -3,8 +3,8 @@
 from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
 from solidgrain.bake.writers.table import (
     PREVIEW,
+    bounds,
     check_output,
-    clips,
     formats,
     kind_of,
     make_output,
@@ -23,8 +23,8 @@ __all__ = [
     "Output",
     "Volume",
     "Writer",
+    "bounds",
     "check_output",
-    "clips",
     "formats",
     "kind_of",
     "make_output",

@@ -18,11 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.color import from_srgb, quantize, triangular
+from solidgrain.bake.color import as_floats, from_srgb, quantize, triangular
 from solidgrain.bake.store import Bytes, Encoded, Finished, Store
 from solidgrain.runtime.workers import Workers
 
 FloatArray = npt.NDArray[np.float32]
+ROUNDING = {2: 2.0**-11, 4: 1e-6}  # by the bytes of a float: half an ulp of a colour below 2, of larger ones in proportion
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,8 @@ class Writer(ABC):
 
     def probe(self, voxels: npt.NDArray[np.int64]) -> tuple[FloatArray, float] | None:
         """The colours [P, 3] that the finished files hold at voxels [P, 3] (x, y, z), in the output's colour space, and how
-        far the format's rounding may move them. None for a format whose error has no bound."""
+        far the format's rounding may move them: those above 1 that many times as far. None for a format whose error has no
+        bound."""
         return None
 
     def colors(self, rgb: FloatArray) -> FloatArray:
@@ -114,13 +116,13 @@ class Writer(ABC):
     def stored(self, slab: FloatArray, z: int, dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
         """Slices z, z + 1, ... in the colour space of this output, as floats or unsigned whole numbers."""
         whole = np.dtype(dtype).kind == "u"
-        return np.ascontiguousarray(self.quantized(slab, z, dtype) if whole else self.colors(slab), dtype)
+        return np.ascontiguousarray(self.quantized(slab, z, dtype) if whole else as_floats(self.colors(slab), dtype))
 
     def read_back(self, values: npt.NDArray[Any]) -> tuple[FloatArray, float]:
-        """What `stored` made of colours, as colours, and how far it may have moved them: half an ulp, or steps' rounding."""
+        """What `stored` made of colours, as colours, and how far it may have moved them, as `probe` says."""
         colors = values.astype(np.float32)
         if values.dtype.kind == "f":
-            return colors, 2**-11 if values.dtype.itemsize == 2 else 1e-6
+            return colors, ROUNDING[values.dtype.itemsize]
         largest = np.iinfo(values.dtype).max
         steps = 1.5 if self.output.options["dither"] else 0.5
         return colors / np.float32(largest), steps / largest + 1e-6

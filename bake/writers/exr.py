@@ -16,16 +16,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.color import LINEAR, LUMA, SRGB, to_half, to_linear
+from solidgrain.bake.color import LINEAR, LUMA, SRGB, as_floats, to_linear
 from solidgrain.bake.frames import frame_paths
 from solidgrain.bake.store import Encoded, Finished, Store
-from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
+from solidgrain.bake.writers.base import ROUNDING, FloatArray, Option, Output, Volume, Writer
 from solidgrain.bake.writers.exr_zip import LINES, deflated, isal_zlib
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.workers import Workers
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # xy of red, green, blue, white (ITU-R BT.709)
-HALF_LARGEST = np.float32(65504)
 SOURCES = ("r", "g", "b", "luma", "one")
 TYPES = {"half": np.float16, "float": np.float32}
 COMPRESSIONS = ("none", "zip", "zips", "piz", "dwaa")
@@ -65,13 +64,11 @@ class ExrStack(Writer):
     def _channels(self, srgb: FloatArray) -> dict[str, npt.NDArray[np.generic]]:
         """What the file's channels hold, [y, x] each; plain RGB in one piece, which is faster."""
         dtype, rgb = TYPES[str(self.output.options["type"])], self.colors(srgb)
-        if dtype is np.float16 and self.output.colorspace not in (LINEAR, SRGB):
-            rgb = rgb.clip(-HALF_LARGEST, HALF_LARGEST)  # beyond it, half-float is infinite
         if list(self.channels.items()) == [("R", "r"), ("G", "g"), ("B", "b")]:
-            return {"RGB": to_half(rgb) if dtype is np.float16 else np.ascontiguousarray(rgb, dtype)}
-        values = {"luma": to_linear(srgb) @ LUMA, "one": np.ones(rgb.shape[:2], dtype)}
+            return {"RGB": as_floats(rgb, dtype)}
+        values = {"luma": to_linear(srgb) @ LUMA, "one": np.ones(rgb.shape[:2], np.float32)}
         values |= {source: rgb[..., k] for k, source in enumerate("rgb")}
-        return {name: np.ascontiguousarray(values[source], dtype) for name, source in self.channels.items()}
+        return {name: as_floats(values[source], dtype) for name, source in self.channels.items()}
 
     def probe(self, voxels: npt.NDArray[np.int64]) -> tuple[FloatArray, float] | None:
         import OpenEXR
@@ -87,8 +84,7 @@ class ExrStack(Writer):
                 channels = file.channels()
                 for k, source in enumerate("rgb"):
                     values[here, k] = channels[names[source]].pixels[voxels[here, 1], voxels[here, 0]]
-        largest = max(1.0, float(np.abs(values).max()))
-        return values, largest * (2.0**-11 if self.output.options["type"] == "half" else 1e-6)
+        return values, ROUNDING[np.dtype(TYPES[str(self.output.options["type"])]).itemsize]
 
     def assemble(self, store: Store) -> list[Finished]:
         return [Finished(store.folder / path.name, path) for path in self.paths]

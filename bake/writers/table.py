@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from solidgrain.bake.color import LINEAR, SRGB, color_options
+from solidgrain.bake.color import HALF_LARGEST, LINEAR, SRGB, color_options
 from solidgrain.bake.writers.base import Option, Output, Volume, Writer
 from solidgrain.bake.writers.mips import FILTERS, MippedWriter, level_output, level_volumes
 from solidgrain.bake.writers.orient import SPOOL_BYTES, UPRIGHT, OrientedWriter, oriented
@@ -183,6 +184,14 @@ def clips(output: Output) -> bool:
     return str(output.options.get("type", "uint8" if output.kind == ".atlas.png" else "float")) in WHOLE_NUMBERS
 
 
+def bounds(output: Output) -> tuple[float, float]:
+    """The least and the greatest colour that its files can hold."""
+    if clips(output):
+        return 0.0, 1.0
+    half = output.options.get("type") in HALVES or output.kind == ".atlas.exr"
+    return (-float(HALF_LARGEST), float(HALF_LARGEST)) if half else (-math.inf, math.inf)
+
+
 def rounds(output: Output) -> bool:
     """Whether its colours become whole numbers, blocks of them included: what dither is for."""
     return clips(output) or output.options.get("type") in BLOCKS
@@ -190,3 +199,4 @@ def rounds(output: Output) -> bool:
 
 BLOCKS = ("bc1", "bc7")
 WHOLE_NUMBERS = ("uint8", "uint16", "rgba8")
+HALVES = ("half", "rgba16f")

@@ -22,9 +22,10 @@ from typing import BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from solidgrain.bake.color import as_floats
 from solidgrain.bake.store import Bytes, Encoded, Finished, Record, Store
 from solidgrain.bake.writers import vdb_tree
-from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
+from solidgrain.bake.writers.base import ROUNDING, FloatArray, Option, Output, Volume, Writer
 from solidgrain.bake.writers.vdb_read import read_colors
 from solidgrain.bake.writers.vdb_tree import LEAF, LOWER, UPPER, Grid, Triple, blocks
 from solidgrain.runtime.errors import UsageError
@@ -33,7 +34,6 @@ from solidgrain.runtime.workers import Workers
 DENSITY = "density"
 COLUMNS = "columns"  # stream: each slab as columns (x, y) of at most 128 by 128, y fastest, each [z, y, x, 3]
 LARGEST = 2**31  # voxels along an axis: coordinates are int32
-ROUNDING = {"half": 2.0**-11, "float": 1e-6}  # of values below 2
 OPTIONS = (
     Option("type", "half", "of the values", ("half", "float")),
     Option("compression", "none", "zlib: smaller files, by a quarter at most", ("none", "zlib")),
@@ -55,7 +55,8 @@ class VdbFile(Writer):
 
         def convert(k: int, column: int) -> None:
             (x, y, _), (width, height, _) = columns[column]
-            values[column][k] = self.colors(np.ascontiguousarray(slab[k, y : y + height, x : x + width]))
+            colors = self.colors(np.ascontiguousarray(slab[k, y : y + height, x : x + width]))
+            values[column][k] = as_floats(colors, self.color.dtype)
 
         self.workers.run([partial(convert, k, column) for column in range(len(columns)) for k in range(len(slab))])
         return Encoded({COLUMNS: [column.data for column in values]})
@@ -130,7 +131,7 @@ class VdbFile(Writer):
         return np.frombuffer(b"".join(parts), f"V{self.color.voxel_bytes}").reshape(depth, height, width)
 
     def probe(self, voxels: npt.NDArray[np.int64]) -> tuple[FloatArray, float] | None:
-        return read_colors(self.output.path, self.color, self.box, voxels), ROUNDING[str(self.output.options["type"])]
+        return read_colors(self.output.path, self.color, self.box, voxels), ROUNDING[2 if self.color.half else 4]
 
 
 def grids(output: Output) -> tuple[Grid, Grid]:

@@ -264,6 +264,23 @@ def test_a_space_without_an_identifier_is_named_in_the_exr_and_half_stays_finite
     assert blinding[..., 1].min() == -65504
 
 
+def test_half_floats_of_every_format_stay_finite_and_are_verified(toy_folder, tmp_path):
+    """Of colours far above 1 half an ulp is far more than of those below, and some are more than any half-float."""
+    config = write_config(tmp_path / "studio.ocio")
+    code = "from solidgrain.bake.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
+    environment = {**os.environ, "OCIO": str(config)}
+    outputs = [tmp_path / name for name in ("a.####.exr", "a.vdb", "a.raw", "a.dds", "a.atlas.exr", "a.vti")]
+    types = ("--raw-type", "half", "--dds-type", "rgba16f", "--vti-type", "float32", "--colorspace", "blinding")
+    outs = [word for output in outputs for word in ("--out", output)]
+    for command in (["bake", toy_folder, "--size", "4x4x2", *outs, *types, "--quiet"], ["verify", *outputs]):
+        ran = subprocess.run(
+            [sys.executable, "-W", "error", "-c", code, *command], env=environment, capture_output=True, text=True, check=False
+        )
+        assert ran.returncode == 0, ran.stderr + ran.stdout
+    raw = np.fromfile(tmp_path / "a.raw", "<f2")
+    assert (raw.max(), raw.min()) == (65504, -65504)
+
+
 def test_the_flags_reach_every_output_but_the_preview(toy_folder, solidgrain, tmp_path):
     outcome = solidgrain(
         *("bake", toy_folder, "--size", "4", "--dry-run", "--json", "--colorspace", "ACEScg", "--dither"),
@@ -351,9 +368,9 @@ def test_half_floats_are_numpys_bit_for_bit():
         draw.random(1_000_000, np.float32),
         np.exp2(draw.uniform(-14, 16, 1_000_000)).astype(np.float32).clip(None, 65503),
         np.exp2(draw.uniform(-30, 0, 100_000)).astype(np.float32),
-        np.array([0.0, 1.0, 0.5, 2.0**-14, 65503.9, 70000.0, np.inf], np.float32),
+        np.array([0.0, 1.0, 0.5, 2.0**-14, 65503.9, 70000.0, -7e4, np.inf], np.float32),
         (np.arange(2**16, dtype=np.uint32) * 4096 + 0x38800000).view(np.float32)[:40000],  # every tie
         np.empty((0, 3), np.float32),
     ):
-        with np.errstate(over="ignore"):
-            assert np.array_equal(to_half(values).view(np.uint16), values.astype(np.float16).view(np.uint16))
+        finite = values.clip(-65504, 65504)
+        assert np.array_equal(to_half(values).view(np.uint16), finite.astype(np.float16).view(np.uint16))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -131,6 +132,14 @@ def test_one_wrong_voxel_in_ten_thousand_checksums_aside(solidgrain, files):
     """A plan is evaluated again voxel by voxel, exactly as the bake did it in slabs."""
     outcome = solidgrain("verify", "a.npy", "--voxels", 12 * 8 * 20, "--json")
     assert json.loads(outcome.out)["outputs"][0]["largest"] < 1e-6
+    colors = np.load(files / "a.npy")
+    colors[11, 3, 7] += np.float32(0.01)
+    np.save(files / "a.npy", colors)
+    manifest = json.loads((files / "a.npy.bake.json").read_text())
+    manifest["files"]["a.npy"]["sha256"] = sha256((files / "a.npy").read_bytes()).hexdigest()
+    (files / "a.npy.bake.json").write_text(json.dumps(manifest))
+    outcome = solidgrain("verify", "a.npy", "--voxels", 12 * 8 * 20)
+    assert (outcome.code, "by up to 0.0100" in outcome.out) == (3, True), outcome.out
 
 
 def test_another_texture_under_the_same_name_is_named(solidgrain, tmp_path):
