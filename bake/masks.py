@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tokenize
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.runtime.errors import BakeError, UsageError
+from solidgrain.runtime.files import DAMAGED_ARRAY
 
 Vector = tuple[float, float, float]
-DAMAGED_ARRAY = (OSError, ValueError, EOFError, SyntaxError, tokenize.TokenError)  # what NumPy raises for an .npy that is none
 
 
 class MaskFile(NamedTuple):

@@ -10,11 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.bake.color import LINEAR, LUMA, SRGB, quantize, to_srgb
-from solidgrain.bake.masks import DAMAGED_ARRAY
 from solidgrain.bake.messages import warn
 from solidgrain.bake.opengl import has_display, off_screen_environment, require_opengl
 from solidgrain.runtime.errors import ViewError
-from solidgrain.runtime.files import temporary_name
+from solidgrain.runtime.files import DAMAGED_ARRAY, temporary_name
 
 if TYPE_CHECKING:
     import pyvista

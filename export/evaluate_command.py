@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load_texture
     from solidgrain.runtime.blend_file import BlendData
-    from solidgrain.runtime.provider import usable_threads
+    from solidgrain.runtime.workers import usable_threads
     from solidgrain.train.inception import Inception
     from solidgrain.train.photograph import read_exemplar
     from solidgrain.train.quality import SMALLEST

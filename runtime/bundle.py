@@ -149,5 +149,13 @@ def find_bundle(sampler_sha256: str, near: Path) -> Path | None:
     return None
 
 
+def open_again(sampler_sha256: str, folder: Path) -> Bundle:
+    """The bundle that was opened in a folder, or the embedded one that it is. Raises BundleError if it is no longer there."""
+    found = find_bundle(sampler_sha256, folder)
+    if found is None:
+        raise BundleError(f"{folder}: the bundle whose sampler.onnx has sha256 {sampler_sha256[:12]}… is no longer there")
+    return open_bundle(found)
+
+
 def _embedded_root() -> Path:
     return Path(str(resources.files("solidgrain.runtime"))) / "embedded"

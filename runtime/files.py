@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -14,8 +15,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-# What numpy raises for an archive that is damaged, or none.
-DAMAGED_ARCHIVE = (ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error)
+# What NumPy raises for an .npy that is damaged, or none, and for an archive; RuntimeError: an encrypted one.
+DAMAGED_ARRAY = (OSError, ValueError, EOFError, SyntaxError, tokenize.TokenError)
+DAMAGED_ARCHIVE = (*DAMAGED_ARRAY, KeyError, TypeError, IndexError, RuntimeError, zipfile.BadZipFile, zlib.error)
 LARGE = 2**31 - 2**20  # bytes: from here on, an archive's member needs 64-bit sizes
 
 

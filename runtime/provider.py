@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from solidgrain.runtime.errors import BundleError, ProviderError
 from solidgrain.runtime.noise import RESOLUTION
 from solidgrain.runtime.texture_file import TextureData
+from solidgrain.runtime.workers import usable_threads
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -37,11 +37,6 @@ def provider_options(full_name: str) -> dict[str, Any]:
 def memory_device(full_name: str) -> str:
     """Where a provider wants its inputs, as ONNX Runtime names devices: "cuda", "dml", or "cpu" for all others."""
     return DEVICES.get(full_name, "cpu")
-
-
-def usable_threads() -> int:
-    """How many processors this process may use: its affinity mask, not the machine's count."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_inputs(session: onnxruntime.InferenceSession, texture: TextureData, path: Path) -> None:

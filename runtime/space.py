@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from solidgrain.runtime.blend_file import BlendData, blend_of
-from solidgrain.runtime.bundle import ENCODER, MAPPING, Bundle, bundle_folder, open_bundle
+from solidgrain.runtime.bundle import ENCODER, MAPPING, Bundle, bundle_folder, open_again, open_bundle
 from solidgrain.runtime.errors import BundleError, ExemplarError
 from solidgrain.runtime.mask import Mask, Vector, make_mask, make_ramp
 from solidgrain.runtime.provider import open_session
@@ -46,6 +47,11 @@ def load_space(
     return Space(owner, provider, precision, make_workers(threads))
 
 
+def _opened_again(sampler_sha256: str, folder: Path, provider: str, precision: str, threads: int) -> Space:
+    """What a copy of a space begins as, in this process or in another one."""
+    return Space(open_again(sampler_sha256, folder), provider, precision, make_workers(threads))
+
+
 class Space:
     """A space of textures: an encoder, a mapping and the sampler that all of its textures share. Made by `load`."""
 
@@ -53,6 +59,11 @@ class Space:
         self.bundle, self._provider, self._precision, self.workers = bundle, provider, precision, workers
         self._encoder = _graph(bundle, ENCODER, ["exemplar"], ["z"])
         self._mapping = _graph(bundle, MAPPING, ["z"], ["transforms", "gamma", "delta", "noise_weights"])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled, it is its bundle by the folder, as a texture's is."""
+        asked = (self._provider, self._precision, self.workers.asked)
+        return _opened_again, (self.bundle.sampler_sha256, self.bundle.folder, *asked)
 
     @property
     def name(self) -> str:
@@ -70,7 +81,7 @@ class Space:
         first, and the texture's pixels are then the smaller picture's. `scale` is by how much it was: the texture remembers
         it, for whoever compares it with the photograph.
         """
-        if not 0 < scale < math.inf:
+        if not isinstance(scale, int | float | np.number) or not 0 < scale < math.inf:
             raise ExemplarError(f"scale {scale!r}: expected a number above 0")
         return self.open(replace(self.mapped(self.code(exemplar), name), scale=float(scale)))
 

@@ -16,11 +16,10 @@ import numpy.typing as npt
 from solidgrain.runtime.blend_engine import open_blend_engine
 from solidgrain.runtime.blend_file import FORMAT as BLEND_FORMAT
 from solidgrain.runtime.blend_file import BlendData, read_blend, write_blend
-from solidgrain.runtime.bundle import TEXTURE, Bundle, bundle_folder, find_bundle, open_bundle
+from solidgrain.runtime.bundle import TEXTURE, Bundle, bundle_folder, find_bundle, open_again, open_bundle
 from solidgrain.runtime.engine import Engine, Instance, open_engine
-from solidgrain.runtime.errors import BundleError, EvaluationError
+from solidgrain.runtime.errors import BundleError, EvaluationError, ProviderError
 from solidgrain.runtime.lattice import Tiling, tiled, untiled
-from solidgrain.runtime.provider import usable_threads
 from solidgrain.runtime.texture_file import TextureData, format_of, read_texture, write_texture
 from solidgrain.runtime.workers import Workers
 
@@ -62,6 +61,8 @@ def load_texture(
 def open_texture(data: TextureData | BlendData, owner: Bundle, provider: str, precision: str, workers: Workers) -> Texture:
     """A texture on what evaluates it. Raises BundleError or ProviderError."""
     check_fits(data, owner)
+    if not isinstance(provider, str):
+        raise ProviderError(f"provider {provider!r}: expected a name, such as auto")
     if isinstance(data, BlendData):
         engine, note = open_blend_engine(owner, data, provider.lower(), precision)
     else:
@@ -69,14 +70,14 @@ def open_texture(data: TextureData | BlendData, owner: Bundle, provider: str, pr
     return Texture(data, owner, engine, workers, provider, note)
 
 
-def _opened_again(data: TextureData | BlendData, owner: Bundle, provider: str, precision: str, threads: int) -> Texture:
+def _opened_again(data: TextureData | BlendData, folder: Path, provider: str, precision: str, threads: int) -> Texture:
     """What a copy of a texture begins as, in this process or in another one."""
-    return open_texture(data, owner, provider, precision, make_workers(threads))
+    return open_texture(data, open_again(data.sampler_sha256, folder), provider, precision, make_workers(threads))
 
 
 def make_workers(threads: int) -> Workers:
     (count,) = _whole("threads", (threads,), count=1, least=0)
-    return Workers(count or usable_threads())
+    return Workers(count)
 
 
 def check_alone(source: str, bundle: str | os.PathLike[str] | None) -> None:
@@ -109,7 +110,9 @@ def _resolve(source: str, bundle: str | None) -> tuple[TextureData | BlendData, 
 
 
 def check_fits(data: TextureData | BlendData, owner: Bundle) -> None:
-    """Raises BundleError if a texture and a bundle do not belong together."""
+    """Raises BundleError if a texture and a bundle do not belong together, or for a name that no file could hold."""
+    if not data.name.isprintable():
+        raise BundleError(f"texture {data.name!r}: expected a name of printable characters; give it another one")
     if data.sampler_sha256 != owner.sampler_sha256:
         fitting = find_bundle(data.sampler_sha256, owner.folder)
         advice = f"that is {fitting.name}, embedded" if fitting else "use the bundle that the texture was made with"
@@ -142,7 +145,7 @@ class Texture:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled, it is its data, and its bundle by the folder: whoever unpickles it opens an engine for it anew."""
-        return _opened_again, (self.data, self.bundle, self._asked, self.precision, self.threads)
+        return _opened_again, (self.data, self.bundle.folder, self._asked, self.precision, self.workers.asked)
 
     @property
     def name(self) -> str:
@@ -216,8 +219,8 @@ class Texture:
         slabs = self.slabs(shape, seed, origin=origin, spacing=spacing, tile=tile, period=period, transform=transform)
         try:
             volume = np.empty((*_positive("shape", shape), 3), np.float32)
-        except ValueError as error:
-            raise EvaluationError(f"shape {shape}: more than any array holds; take slabs() instead") from error
+        except (ValueError, MemoryError) as error:
+            raise EvaluationError(f"shape {shape}: more than an array can hold here; take slabs() instead") from error
         for z, slab in slabs:
             volume[z : z + len(slab)] = slab
         return volume
@@ -299,6 +302,8 @@ class Texture:
     ) -> Tiling:
         """How tiling moves this texture's transforms for such a grid, and by how much (`distortion`)."""
         voxels = _positive("period", shape if period is None else period)
+        if not isinstance(tile, str):
+            raise EvaluationError(f"tile {tile!r}: expected axes to repeat along, a text of x, y and z")
         step = _spacing(spacing)
         matrix = _affine(transform)[:3, :3]
         transforms = self.transforms if transform is None else self.transforms @ matrix

@@ -13,17 +13,29 @@ Task = Callable[[], None]
 T = TypeVar("T")
 
 
-class Workers:
-    """Runs short tasks, several at a time. The work is in native code that lets go of the interpreter."""
+def usable_threads() -> int:
+    """How many processors this process may use: its affinity mask, not the machine's count."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
-    def __init__(self, count: int, pool: _Pool | None = None) -> None:
-        self.count = count
-        self._pool = pool or _Pool(count)
+
+class Workers:
+    """Runs short tasks, several at a time. The work is in native code that lets go of the interpreter.
+
+    `asked` threads of 0 are as many as the process may use.
+    """
+
+    def __init__(self, asked: int, pool: _Pool | None = None) -> None:
+        self.asked = asked
+        self._pool = pool or _Pool(asked or usable_threads())
         self._cancelled = False
+
+    @property
+    def count(self) -> int:
+        return self._pool.count
 
     def share(self) -> Workers:
         """The same threads, to be cancelled on their own."""
-        return Workers(self.count, self._pool)
+        return Workers(self.asked, self._pool)
 
     def run(self, tasks: Sequence[Task]) -> None:
         """All tasks, in any order. The first error, or an interrupt, stops those that have not begun and is raised."""

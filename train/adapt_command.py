@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from solidgrain.bake.sources import check_new
     from solidgrain.runtime import load_space
-    from solidgrain.runtime.provider import usable_threads
+    from solidgrain.runtime.workers import usable_threads
     from solidgrain.train.adapt import FrozenSampler, adapt
 
     check_flags(arguments)

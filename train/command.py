@@ -95,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     import torch
 
-    from solidgrain.runtime.provider import usable_threads
+    from solidgrain.runtime.workers import usable_threads
     from solidgrain.train.processes import ElsewhereError, joined, local_device, processes_here
 
     device = local_device(choose_device(arguments.device))

@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def diagnose() -> dict[str, Any]:
     """Everything that the doctor looks at, as plain data; `problems` is empty on a healthy installation."""
-    from solidgrain.runtime.provider import usable_threads
+    from solidgrain.runtime.workers import usable_threads
 
     problems: list[str] = []
     return {

@@ -24,8 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.baker import merge
-    from solidgrain.runtime.provider import usable_threads
-    from solidgrain.runtime.workers import Workers
+    from solidgrain.runtime.workers import Workers, usable_threads
 
     plan = to_merge(find_plan(arguments.target), arguments.overwrite)
     merged = merge(plan, Workers(usable_threads()))

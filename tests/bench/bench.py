@@ -17,7 +17,7 @@ from typing import Any
 from solidgrain.bake.arguments import parse_positive
 from solidgrain.runtime import embedded_names
 from solidgrain.runtime.kernel import BFLOAT16_PATHS, kernel_paths
-from solidgrain.runtime.provider import usable_threads
+from solidgrain.runtime.workers import usable_threads
 from tests.bench import measure
 
 MEGA = 1e6

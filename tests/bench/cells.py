@@ -23,7 +23,7 @@ from torch import Tensor
 from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive
 from solidgrain.runtime.errors import SolidgrainError, TrainingError, UsageError
 from solidgrain.runtime.files import replacing
-from solidgrain.runtime.provider import usable_threads
+from solidgrain.runtime.workers import usable_threads
 from solidgrain.train.colors import settle_mean
 from solidgrain.train.cuts import Sample
 from solidgrain.train.exemplar import FloatArray

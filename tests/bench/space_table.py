@@ -28,7 +28,7 @@ from solidgrain.bake.arguments import parse_count, parse_positive, parse_scale, 
 from solidgrain.export.evaluation import grain_of
 from solidgrain.runtime import SolidgrainError, Space, UsageError, load_space
 from solidgrain.runtime.bundle import ENCODER, MAPPING, SAMPLER
-from solidgrain.runtime.provider import usable_threads
+from solidgrain.runtime.workers import usable_threads
 from solidgrain.train.companion import find_companion
 from solidgrain.train.cuts import as_image
 from solidgrain.train.exemplar import FloatArray

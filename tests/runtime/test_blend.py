@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import pickle
 import shutil
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from solidgrain.export.bundle import Details, write_bundle
-from solidgrain.runtime import BundleError, EvaluationError, ProviderError, load_space, load_texture
+from solidgrain.runtime import BundleError, EvaluationError, ExemplarError, ProviderError, load_space, load_texture
 from solidgrain.runtime.blend_file import BlendData, blend_of, read_blend
 from solidgrain.runtime.bundle import BLEND, MANIFEST
 from solidgrain.runtime.lattice import tiled
@@ -407,3 +408,10 @@ def test_a_colour_that_comes_out_as_no_number_is_an_error(space, ramp):
     )
     with pytest.raises(EvaluationError, match=r"broken: the sampler returned NaN at \(42"):
         space.open(broken).sample([[42.0, 0, 0]])
+
+
+def test_a_copy_of_a_space_is_the_same_space(space):
+    again, code = pickle.loads(pickle.dumps(space)), np.full(LATENT, 0.1, np.float32)
+    assert np.array_equal(again.texture(code).sample([[1, 2, 3]]), space.texture(code).sample([[1, 2, 3]]))
+    with pytest.raises(ExemplarError, match="above 0"):
+        space.encode(np.zeros((64, 64, 3), np.uint8), scale="2")

@@ -176,6 +176,30 @@ def test_a_damaged_texture_file_is_refused(tmp_path, content):
         load(path)
 
 
+def test_a_texture_file_with_any_byte_changed_is_read_or_refused(tmp_path, toy):
+    """Other compression methods, encryption and headers of arrays that are no Python included."""
+    toy.save(tmp_path / "toy.sgt.npz")
+    whole, draw = (tmp_path / "toy.sgt.npz").read_bytes(), np.random.default_rng(0)
+    heads = [place for place in range(len(whole)) if b"PK" in whole[max(0, place - 48) : place]]  # of members and the directory
+    refused = 0
+    for place in [*heads, *draw.integers(0, len(whole), 300).tolist()]:
+        changed = bytearray(whole)
+        changed[place] ^= int(draw.integers(1, 256))
+        (tmp_path / "toy.sgt.npz").write_bytes(changed)
+        try:
+            read_texture(tmp_path / "toy.sgt.npz")
+        except BundleError:
+            refused += 1
+    assert refused > 300
+
+
+@pytest.mark.parametrize("name", ["nul\0x", "a\udcffb", "line\n"])
+def test_a_name_that_no_file_could_hold_is_refused(toy, toy_folder, tmp_path, name):
+    write_texture(tmp_path / "a.sgt.npz", replace(toy.data, name=name))
+    with pytest.raises(BundleError, match="expected a name of printable characters"):
+        load(tmp_path / "a.sgt.npz", bundle=toy_folder)
+
+
 def test_nan_in_a_texture_file_is_refused(tmp_path, toy, toy_folder):
     arrays = toy.data.arrays()
     arrays["gamma"] = np.full_like(arrays["gamma"], np.nan)

@@ -7,7 +7,8 @@ import onnxruntime
 import pytest
 
 from solidgrain.runtime import ProviderError, load, onnx_engine
-from solidgrain.runtime.provider import available_providers, usable_threads
+from solidgrain.runtime.provider import available_providers
+from solidgrain.runtime.workers import usable_threads
 
 OFFERED = ["CUDAExecutionProvider", "DmlExecutionProvider", "CoreMLExecutionProvider", "OpenVINOExecutionProvider"]
 NAMES = {"cuda": OFFERED[0], "directml": OFFERED[1], "dml": OFFERED[1], "coreml": OFFERED[2], "OpenVINO": OFFERED[3]}

@@ -3,11 +3,13 @@
 import copy
 import itertools
 import pickle
+import shutil
 
 import numpy as np
 import pytest
 
-from solidgrain.runtime import EvaluationError, load
+from solidgrain.runtime import BundleError, EvaluationError, load, workers
+from solidgrain.runtime.bundle import embedded_folder
 from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.onnx_engine import CPU_CHUNK
 from tests.reference import color
@@ -194,6 +196,8 @@ def test_colours_are_clipped_to_the_unit_range(toy_folder, tmp_path):
         (lambda t: t.grid((2**40,) * 3), "shape|pixels"),
         (lambda t: t.grid((2**22,) * 3, spacing=1e-3), r"take slabs\(\) instead"),
         (lambda t: t.grid((1, 1, 1), spacing=[1, [2, 3], 1]), "spacing"),
+        (lambda t: t.grid((1, 1, 1), tile=5), "tile"),
+        (lambda t: t.grid((30_000, 30_000, 3_000)), "take slabs"),
     ],
 )
 def test_arguments_that_make_no_sense_are_refused_with_their_name(toy, call, message):
@@ -207,6 +211,30 @@ def test_a_texture_of_a_relative_path_goes_along_when_the_process_changes_its_fo
     pickled = pickle.dumps(texture)
     monkeypatch.chdir(tmp_path)
     assert np.array_equal(pickle.loads(pickled).sample([[1, 2, 3]]), copy.deepcopy(texture).sample([[1, 2, 3]]))
+
+
+def test_a_pickled_texture_opens_the_bundle_that_it_had_and_no_other(toy_folder, tmp_path):
+    """Wherever the package lies, an embedded one; one that was replaced or moved away is an error."""
+    folder = tmp_path / "bundle"
+    shutil.copytree(toy_folder, folder)
+    pickled = pickle.dumps(load(folder))
+    shutil.copy(embedded_folder("lichen") / "sampler.onnx", folder / "sampler.onnx")
+    with pytest.raises(BundleError, match="no longer there"):
+        pickle.loads(pickled)
+    shutil.rmtree(folder)
+    with pytest.raises(BundleError, match="no longer there"):
+        pickle.loads(pickled)
+    moved = tmp_path / "elsewhere" / "lichen"
+    shutil.copytree(embedded_folder("lichen"), moved)
+    pickled = pickle.dumps(load(moved))
+    shutil.rmtree(moved)
+    assert pickle.loads(pickled).bundle.folder == embedded_folder("lichen")
+
+
+def test_a_copy_asks_for_as_many_threads_as_the_original_did(toy_folder, monkeypatch):
+    asked, free = load(toy_folder, threads=2), load(toy_folder)
+    monkeypatch.setattr(workers, "usable_threads", lambda: 5)
+    assert [pickle.loads(pickle.dumps(texture)).threads for texture in (asked, free)] == [2, 5]
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda texture: pickle.loads(pickle.dumps(texture))])
