@@ -12,13 +12,13 @@ import importlib
 import io
 import os
 import re
-import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from types import FrameType, ModuleType
 from typing import NoReturn
 
+from solidgrain.bake.interrupts import on_stop
 from solidgrain.bake.messages import tell, tell_error
 
 COMMANDS = {
@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     """The command, and one line for each kind of error."""
     with suppress(ValueError):  # in another thread than the one that signals interrupt
-        signal.signal(signal.SIGTERM, _interrupt)  # farms stop jobs with SIGTERM: clean up as for Ctrl-C
+        on_stop(_interrupt)  # clean up as for Ctrl-C
     try:
         parser, module = _parser(arguments)
     except ModuleNotFoundError as error:

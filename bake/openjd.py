@@ -24,10 +24,10 @@ def emit(
     plan: Plan, folder: Path, shards: int | None = None, overwrite: bool = False, provider: str = "auto", threads: int = 0
 ) -> list[Path]:
     """Write the template and the plan. Raises BakeError if they cannot be written, or exist and may not be replaced."""
-    flags = ["--provider", provider] if provider != "auto" else []
-    flags += ["--threads", str(threads)] if threads else []
+    evaluation = ["--provider", provider] if provider != "auto" else []
+    work = ["--threads", str(threads)] if threads else []
     files = {
-        folder / JOB: template(plan, shard_count(plan, shards), flags, overwrite),
+        folder / JOB: template(plan, shard_count(plan, shards), evaluation, work, overwrite),
         folder / PLAN: anywhere(plan).to_json(),
     }
     if existing := next((path for path in files if path.exists() and not overwrite), None):
@@ -42,9 +42,9 @@ def emit(
     return list(files)
 
 
-def template(plan: Plan, shards: int, flags: list[str], overwrite: bool) -> dict[str, Any]:
-    """The job: `shards` tasks that bake, then one that merges."""
-    replacement = ["--overwrite"] if overwrite else []
+def template(plan: Plan, shards: int, evaluation: list[str], work: list[str], overwrite: bool) -> dict[str, Any]:
+    """The job: `shards` tasks that bake, with flags of `evaluation`, then one that merges; all with those of `work`."""
+    work = [*work, *(["--overwrite"] if overwrite else [])]
     share = ["--shard", f"{{{{Task.Param.Shard}}}}/{shards}"]
     parameter = {"name": "Shard", "type": "INT", "range": f"1-{shards}" if shards > 1 else "1"}
     return {
@@ -58,12 +58,12 @@ def template(plan: Plan, shards: int, flags: list[str], overwrite: bool) -> dict
             {
                 "name": "Bake",
                 "parameterSpace": {"taskParameterDefinitions": [parameter]},
-                "script": _script(["bake", "--plan", "{{Param.Plan}}", *share, *flags, *replacement, "--quiet"]),
+                "script": _script(["bake", "--plan", "{{Param.Plan}}", *share, *evaluation, *work, "--quiet"]),
             },
             {
                 "name": "Merge",
                 "dependencies": [{"dependsOn": "Bake"}],
-                "script": _script(["merge", "{{Param.Plan}}", *replacement]),
+                "script": _script(["merge", "{{Param.Plan}}", *work]),
             },
         ],
     }

@@ -21,7 +21,7 @@ DITHERING = 9  # the same where noise is made, from hashes of 64 bits: 8
 AVERAGING = 3.25  # the same, times the samples per voxel: themselves, their linear light, a term of it, and where that holds
 BASE_MEMORY = 220 * 2**20  # interpreter, libraries, noise tables, the chunks in flight
 FORMAT_VERSION = 1  # of plans and manifests
-BYTES_VERSION = 3  # of what writers make of a plan: one more with every change of it
+BYTES_VERSION = 4  # of what writers make of a plan: one more with every change of it
 
 Matrix = tuple[tuple[float, ...], ...]
 

@@ -48,7 +48,7 @@ def verify(
     if voxels and not wrong:
         plan, output = _planned(manifest, path)
         texture = _texture(plan, path, source, bundle, provider, threads)
-        check_texture(plan, texture, f"{path}")
+        check_texture(replace(plan, source=source or plan.source), texture, f"{path}")
         compared, largest = compare(plan, output, texture, voxels)
         if not largest <= MACHINES[texture.precision]:
             wrong.append(f"{output_path}: voxels differ from the texture by up to {largest:.4f} beyond rounding")

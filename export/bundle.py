@@ -16,7 +16,7 @@ import onnx
 import onnxruntime
 
 from solidgrain.export.blend_graph import build_blend_graph
-from solidgrain.export.sampler_graph import OPSET, build_sampler_graph
+from solidgrain.export.sampler_graph import build_sampler_graph
 from solidgrain.export.space_graphs import EncoderWeights, MappingWeights, build_encoder_graph, build_mapping_graph
 from solidgrain.runtime.bundle import (
     BLEND,
@@ -133,7 +133,7 @@ def _fill(folder: Path, content: SamplerWeights | SpaceWeights, details: Details
         "format_version": FORMAT_VERSION,
         "name": details.name,
         "producer": f"solidgrain {version('solidgrain')}, onnx {onnx.__version__}",
-        "opset": OPSET,
+        "opset": model.opset_import[0].version,
         "octaves": octaves,
         "width": width,
         "hidden_layers": layers,

@@ -1,7 +1,7 @@
 """`sampler.onnx`: points in, colour out, as plain ONNX arithmetic (GramGAN Eq. 1, 2 and 5).
 
 The graph is written here operator by operator rather than traced from torch, so that it holds what the formula holds and
-nothing newer than opset 17. There is no GridSample in it (5-D needs opset 20, wraps around nowhere, and several execution
+nothing newer than opset 16. There is no GridSample in it (5-D needs opset 20, wraps around nowhere, and several execution
 providers lack it): the trilinear lookup is Gather and arithmetic.
 
 Conventions. P points, n octaves in four bins of q = n/4, m hidden units. `T`, `A`, `W`, `b`, `eta` are the paper's letters.
@@ -24,7 +24,6 @@ import spox
 import spox.opset.ai.onnx.v17 as op
 from spox import Tensor, Var, argument
 
-OPSET = 17
 RESOLUTION = 64  # texels along each axis of a noise table
 TEXELS = RESOLUTION**3
 SLOPE = 0.2  # of the leaky ReLU (gramgan/models.py)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
+from solidgrain.bake.interrupts import on_stop
 from solidgrain.bake.messages import tell, warn
 
 if TYPE_CHECKING:
@@ -30,12 +31,12 @@ Report = TypeVar("Report", bound=Dated)
 
 
 class StopRequest:
-    """Ctrl-C or SIGTERM asks the loop to finish its iteration and save; a second one stops at once."""
+    """Ctrl-C, SIGTERM or SIGHUP asks the loop to finish its iteration and save; a second one stops at once."""
 
     def __init__(self, quiet: bool) -> None:
         self._requested, self._quiet = False, quiet
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._request)
+        signal.signal(signal.SIGINT, self._request)
+        on_stop(self._request)
 
     def requested(self) -> bool:
         return self._requested

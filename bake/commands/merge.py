@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from solidgrain.bake.arguments import parse_count
 from solidgrain.bake.messages import tell
 from solidgrain.runtime.errors import BakeError, UsageError
 
@@ -18,16 +19,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("target", type=Path, metavar="TARGET", help="the plan file that was sharded, or the output (a.vti, a.####.exr)")
     add("--overwrite", action="store_true", help="replace outputs that exist")
+    add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
     add("--json", action="store_true", help="print one JSON object on stdout")
     add("--quiet", action="store_true", help="no message on stderr")
 
 
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.baker import merge
-    from solidgrain.runtime.workers import Workers, usable_threads
+    from solidgrain.runtime.workers import Workers
 
     plan = to_merge(find_plan(arguments.target), arguments.overwrite)
-    merged = merge(plan, Workers(usable_threads()))
+    merged = merge(plan, Workers(arguments.threads))
     files = [str(path) for path in merged.files]
     if arguments.json:
         print(json.dumps({"plan": plan.to_json(), "files": files, "seconds": round(merged.seconds, 3)}, indent=2))

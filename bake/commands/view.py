@@ -6,6 +6,8 @@ import argparse
 import signal
 from pathlib import Path
 
+from solidgrain.bake.interrupts import on_stop
+
 MODES = ("slices", "volume", "threshold", "block")
 
 
@@ -19,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.bake.view import show
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_DFL)  # VTK's event loop never returns to Python's own handlers
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # VTK's event loop never returns to Python's own handlers
+    on_stop(signal.SIG_DFL)
     show(arguments.file, arguments.mode, arguments.screenshot)
     return 0

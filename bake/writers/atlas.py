@@ -106,6 +106,7 @@ class AtlasFile(Writer):
         """Write the image. Returns the checksum of its pixels."""
         import OpenImageIO as oiio
 
+        oiio.attribute("exr_threads", -1)  # its own threads would come on top of ours
         image, digest = oiio.ImageOutput.create(os.fspath(path)), hashlib.sha256()
         if image is None or not image.open(os.fspath(path), self._spec(tiles)):
             raise self._failed("write", image.geterror() if image else oiio.geterror())

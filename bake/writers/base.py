@@ -53,8 +53,12 @@ class Volume:
 
     @property
     def notes(self) -> dict[str, str]:
-        """What a file says of where its colours come from: with these, `Texture.sample` gives them again."""
-        notes = {"texture": self.texture, "seed": str(self.seed), "axes": self.axes}
+        """What a file says of where its colours come from, besides its place: with both, `Texture.grid` gives them again."""
+        notes = {"texture": self.texture, "model": self.sampler_sha256, "seed": str(self.seed), "axes": self.axes}
+        if self.tile:
+            notes["tile"] = self.tile
+        if self.level:
+            notes["level"] = str(self.level)
         return notes | ({"transform": json.dumps(self.transform)} if self.transform else {})
 
 

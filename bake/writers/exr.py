@@ -113,6 +113,8 @@ def slice_header(output: Output, volume: Volume, z: int) -> dict[str, Any]:
         "solidgrain:json": json.dumps({"origin": volume.origin, "spacing": volume.spacing}),  # unrounded
         "solidgrain:axes": f"column {column}, row {row} downwards from the top, slice {along}",
     }
+    if volume.level:
+        header["solidgrain:level"] = volume.level
     if volume.transform:
         header["solidgrain:transform"] = volume.notes["transform"]
     if volume.tile:

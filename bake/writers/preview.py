@@ -38,7 +38,7 @@ class Plane:
     axis: int
     index: int
 
-    def across(self, extents: Sequence[int]) -> tuple[int, int]:
+    def across(self, extents: Sequence[float]) -> tuple[float, float]:
         """Of the extents along x, y and z, those of the plane's rows and columns."""
         columns, rows = (extent for axis, extent in enumerate(extents) if axis != self.axis)
         return rows, columns
@@ -91,9 +91,11 @@ class PreviewFile(Writer):
         rows, columns = ("zyx"[axis] for axis in range(3) if axis != 2 - plane.axis)
         return np.tile(picture, (1 + (rows in self.volume.tile), 1 + (columns in self.volume.tile), 1))
 
-    def _extents(self) -> list[int]:
-        """Voxels along x, y and z, repeats included."""
-        return [extent * (1 + (axis in self.volume.tile)) for axis, extent in zip("xyz", self.volume.shape[::-1], strict=True)]
+    def _extents(self) -> list[float]:
+        """Exemplar pixels along x, y and z, repeats included."""
+        volume = self.volume
+        lengths = [count * step for count, step in zip(volume.shape[::-1], volume.spacing, strict=True)]
+        return [length * (1 + (axis in volume.tile)) for axis, length in zip("xyz", lengths, strict=True)]
 
     def _write(self, path: Path, picture: npt.NDArray[np.generic]) -> None:
         """OpenImageIO reports success on a full disk: only reading the file back tells."""
@@ -111,8 +113,8 @@ class PreviewFile(Writer):
         sync(path)
 
 
-def fit(plane: FloatArray, extents: tuple[int, int]) -> FloatArray:
-    """A plane scaled into a panel, nearest sample, centred; its proportions are those of its voxels, `extents` (rows, columns),
+def fit(plane: FloatArray, extents: tuple[float, float]) -> FloatArray:
+    """A plane scaled into a panel, nearest sample, centred; its proportions are `extents` (rows, columns),
     of which either axis may have been thinned."""
     scale = PANEL / max(extents)
     rows, columns = (
@@ -126,7 +128,7 @@ def fit(plane: FloatArray, extents: tuple[int, int]) -> FloatArray:
     return panel
 
 
-def draw_block(faces: Sequence[FloatArray], extents: Sequence[int]) -> FloatArray:
+def draw_block(faces: Sequence[FloatArray], extents: Sequence[float]) -> FloatArray:
     """The block in parallel projection, z up, its three visible faces sampled from `faces` (x = last, y = 0, z = last)."""
     half = np.array(extents, float) / (2 * max(extents))
     toward = VIEW / np.linalg.norm(VIEW)

@@ -205,11 +205,11 @@ def test_a_model_that_returns_nan_leaves_nothing_behind(solidgrain, tmp_path):
     assert list((tmp_path / "out").iterdir()) == []
 
 
-# Shells let the jobs that they start in the background ignore Ctrl-C, and children inherit it.
-HEEDING = ("env", "--default-signal=INT")
+# Shells let the jobs that they start in the background ignore Ctrl-C, nohup SIGHUP, and children inherit it.
+HEEDING = ("env", "--default-signal=INT,HUP")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_leaves_nothing_behind_and_exits_with_130(tmp_path, toy_folder, number):
     command = [*HEEDING, sys.executable, "-m", "solidgrain.bake.cli", "bake", toy_folder, "--size", "512", "--quiet"]
     outputs = ["--out", tmp_path / "a.####.exr", "--out", tmp_path / "a.vti", "--out", tmp_path / "a.npy"]

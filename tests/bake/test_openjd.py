@@ -98,7 +98,7 @@ def test_an_emitted_job_is_kept_unless_told_otherwise(solidgrain, toy_folder, tm
     bake, merge = json.loads((tmp_path / "job" / "job.json").read_text())["steps"]
     words = bake["script"]["actions"]["onRun"]["args"]
     assert words[-6:] == ["--provider", "cpu", "--threads", "2", "--overwrite", "--quiet"]
-    assert merge["script"]["actions"]["onRun"]["args"] == ["merge", "{{Param.Plan}}", "--overwrite"]
+    assert merge["script"]["actions"]["onRun"]["args"] == ["merge", "{{Param.Plan}}", "--threads", "2", "--overwrite"]
 
 
 def test_what_a_bake_would_refuse_is_not_emitted(solidgrain, toy_folder, tmp_path):
@@ -132,7 +132,7 @@ def test_a_name_that_the_format_would_replace_stays_readable(toy, tmp_path):
     from dataclasses import replace
 
     plan = replace(anywhere(plan_of_depth(toy, 4)), texture="{{Param.Plan}}\n" + 100 * "é")
-    job = template(plan, 1, [], overwrite=False)
+    job = template(plan, 1, [], [], overwrite=False)
     assert job["name"].startswith("solidgrain bake Param.Plan")
     (tmp_path / "job.json").write_text(json.dumps(job))
     (tmp_path / "plan.json").write_text("{}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -204,7 +205,8 @@ def test_a_tiled_volume_meets_itself_in_the_written_files(toy, tmp_path):
 
 
 def test_the_preview_of_a_tile_shows_its_repeats(toy, tmp_path):
-    bake(plan_for(toy, make_output(tmp_path / "a.png", PREVIEW), tile="xy", size=(16, 16, 32)), toy)
+    plan = plan_for(toy, make_output(tmp_path / "a.png", PREVIEW), tile="xy", size=(16, 16, 32))
+    bake(replace(plan, spacing=(1.0, 1.0, 1.0)), toy)
     picture = oiio.ImageBuf(os.fspath(tmp_path / "a.png")).get_pixels(oiio.FLOAT)
     panels = [picture[:, start : start + 384] for start in (0, 396, 792)]
     across_z, across_y = panels[0], panels[1]
@@ -214,17 +216,18 @@ def test_the_preview_of_a_tile_shows_its_repeats(toy, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("size", "tile", "rows", "columns"),
+    ("size", "spacing", "tile", "rows", "columns"),
     [
-        ((1024, 4, 256), "", 96, 384),
-        ((600, 4, 512), "", 328, 384),
-        ((512, 4, 600), "", 384, 328),
-        ((1024, 4, 256), "z", 192, 384),
+        ((1024, 4, 256), (1, 1, 1), "", 96, 384),
+        ((600, 4, 512), (1, 1, 1), "", 328, 384),
+        ((512, 4, 600), (1, 1, 1), "", 384, 328),
+        ((1024, 4, 256), (1, 1, 1), "z", 192, 384),
+        ((1024, 4, 256), (0.5, 1, 2), "", 384, 384),
     ],
 )
-def test_a_preview_has_the_proportions_of_the_volume_however_it_was_thinned(tmp_path, size, tile, rows, columns):
+def test_a_preview_has_the_proportions_of_the_volume_however_it_was_thinned(tmp_path, size, spacing, tile, rows, columns):
     """The slice across y of a volume that is bright, brighter towards its middle x: more than 512 voxels are thinned."""
-    volume = Volume(size[::-1], ORIGIN, SPACING, "toy", "", 0, tile)
+    volume = Volume(size[::-1], ORIGIN, spacing, "toy", "", 0, tile)
     writer, store = open_writer(make_output(tmp_path / "a.png", PREVIEW), volume, Workers(1)), Store(tmp_path, size[2])
     ramp = 1 - 0.8 * np.abs(np.linspace(-1, 1, size[0], dtype=np.float32))
     store.append(0, size[2], writer.encode(0, np.broadcast_to(ramp[:, None], (*volume.shape, 3))))
