@@ -75,7 +75,7 @@ def evaluate(
     size = min(image.shape[2] // 2, image.shape[3] // 2, LARGEST_CROP)
     squares = [square.pixels for square in spread_out(distinct(disjoint_crops(image, size)), COMPARED)]
     crops = [measure.statistics(square) for square in squares]
-    floor = _mean(measure.distances(a, b) for i, a in enumerate(crops) for b in crops[:i])
+    floor = _mean(measure.distances(a, b) for i, a in enumerate(crops) for j, b in enumerate(crops) if i != j)
     if floor["color"] < SMALLEST_FLOOR:
         raise ExemplarError(
             f"the exemplar has the same colours in each of its squares of {size}² pixels, so that nothing tells how far apart "
@@ -226,6 +226,7 @@ def _frechet(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> float:
 
 
 def _gram_distance(exemplar: list[Tensor], other: list[Tensor]) -> float:
+    """The mean over layers of Gram matrices' relative differences. Relative to the exemplar's: not the same the other way round."""
     return float(np.mean([float(gram_difference(a, b, relative=True)) for a, b in zip(exemplar, other, strict=True)]))
 
 

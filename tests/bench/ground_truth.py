@@ -146,8 +146,8 @@ def views(look: Look, kind: str, name: str, count: int) -> Iterable[Tensor]:
 
 
 def floor(measure: Measure, slices: Sequence[Statistics]) -> Measures:
-    """The mean distance between independent slices."""
-    pairs = [measure.distances(a, b) for i, a in enumerate(slices) for b in slices[:i]]
+    """The mean distance between independent slices, of each from each."""
+    pairs = [measure.distances(a, b) for i, a in enumerate(slices) for j, b in enumerate(slices) if i != j]
     return {name: float(np.mean([pair[name] for pair in pairs])) for name in pairs[0]}
 
 

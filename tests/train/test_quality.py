@@ -39,6 +39,13 @@ def test_crops_of_the_exemplar_score_about_one():
         assert 0.4 < evaluation.axis[name][0] < 1.6
 
 
+def test_the_floor_is_the_same_whichever_crop_comes_first():
+    """Gram matrices differ relatively to the first of a pair: an exemplar that is dark on one side and one turned around."""
+    exemplar = EXEMPLAR * np.linspace(0.4, 1, 128, dtype=np.float32)[:, None]
+    floors = [evaluate(np.ascontiguousarray(one), resampled, slices=1).floor for one in (exemplar, exemplar[::-1, ::-1])]
+    assert floors[0] == pytest.approx(floors[1], rel=0.02)
+
+
 def test_slices_from_each_other_tell_a_texture_that_varies_from_one_that_repeats_itself():
     varied = evaluate(EXEMPLAR, resampled, slices=4)
     assert 0.3 < varied.among["gram"] < 1.6
