@@ -29,6 +29,8 @@ def color_options(colorspace: str, planned: str = "") -> dict[str, str | int]:
     """
     if colorspace in (SRGB, LINEAR):
         return {"colorspace": colorspace, "colorconfig": ""}
+    if not colorspace.isprintable():
+        raise UsageError(f"--colorspace {colorspace!r}: expected printable characters")
     from solidgrain.bake.ocio import canonical, described, fingerprint
 
     name = canonical(colorspace)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -179,13 +179,15 @@ def asked_options(arguments: argparse.Namespace, kind: str) -> dict[str, str | i
     return {**_shared_options(arguments, kind), **given}
 
 
-def unused(paths: Iterable[Path]) -> dict[str, str]:
+def unused(paths: Sequence[Path]) -> dict[str, str]:
     """The flags that none of these outputs has a use for, each with the reason."""
-    from solidgrain.bake.writers import formats, kind_of
+    from solidgrain.bake.writers import formats, kind_of, may_round
 
     written = {formats()[kind_of(path)].name for path in paths}
     others = [row for row in formats().values() if row.name not in written]
     found = {f"--{row.name}-{option.name}": "no --out of this format" for row in others for option in row.options}
+    if not any(may_round(kind_of(path)) for path in paths):
+        found["--dither"] = "no --out of whole numbers"
     if not written:
         found |= dict.fromkeys(SHARED, "the preview has no use for it, and there is no --out")
     return found

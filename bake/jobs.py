@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import json
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -72,6 +73,10 @@ class JobParser(argparse.ArgumentParser):
         flags = (flag for action in self._actions for flag in action.option_strings)
         return sorted({flag.lstrip("-").replace("-", "_") for flag in flags} - PLAIN)
 
+    def is_switch(self, flag: str) -> bool:
+        """Whether a flag has no value."""
+        return next(action.nargs == 0 for action in self._actions if flag in action.option_strings)
+
     def error(self, message: str) -> NoReturn:
         flag = re.match(r"argument --([a-z-]+): ", message)
         raise UsageError(f"{flag[1].replace('-', '_')}: {message[flag.end() :]}" if flag else message)
@@ -90,16 +95,25 @@ def read_jobs(path: Path, work: argparse.Namespace) -> list[Job]:
         if any(job.name == own["name"] for job in jobs):
             raise UsageError(f"{where}: another job has this name, give each its own")
         with _named(where):
-            jobs.append(_read_job(parser, {**_of_use(defaults, own), **own}, where, path.parent, work))
+            jobs.append(_read_job(parser, {**_of_use(defaults, own, path.parent), **own}, where, path.parent, work))
     return jobs
 
 
-def _of_use(defaults: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """The defaults that a job has a use for: not the settings of formats that it does not write."""
+def _of_use(defaults: dict[str, Any], own: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The defaults that a job has a use for: not the settings of formats that it does not write, nor what it says otherwise."""
     from solidgrain.bake.flags import unused
+    from solidgrain.bake.sources import is_photograph
 
-    outputs = _outputs({**defaults, **own})
-    idle = {flag[2:].replace("-", "_") for flag in unused(Path(output["path"]) for output in outputs)}
+    values = {**defaults, **own}
+    idle = {flag[2:].replace("-", "_") for flag in unused([Path(output["path"]) for output in _outputs(values)])}
+    if not values.get("mips"):
+        idle.add("mip_filter")
+    if not is_photograph(os.fspath(folder / values.get("texture", ""))):
+        idle |= {"patch_scale", "crop"}
+    if "box" in own:
+        idle |= {"origin", "spacing"}
+    if {"origin", "spacing"} & own.keys():
+        idle.add("box")
     return {key: value for key, value in defaults.items() if key not in idle}
 
 
@@ -136,7 +150,10 @@ def _flag(parser: JobParser, key: str, value: Any) -> list[str]:
             advice = f": how all jobs are worked off is said beside --jobs, by --{key.replace('_', '-')}"
         raise UsageError(f"unknown key {key!r}{advice}")
     flag = f"--{key.replace('_', '-')}"
-    if isinstance(value, bool):
+    switch, found = parser.is_switch(flag), json.dumps(value)
+    if switch != isinstance(value, bool):
+        raise UsageError(f"{key}: expected {'true or false' if switch else 'a value'}, found {found}")
+    if switch:
         return [flag] if value else []
     return [f"{flag}={','.join(map(str, _flat(value)))}"]
 

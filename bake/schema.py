@@ -83,13 +83,14 @@ def checked_output(output: Output, where: str, /, **options: str | int) -> Outpu
     suffix = ".png" if output.kind == PREVIEW else output.kind
     if not output.path.name.lower().endswith(suffix):
         raise UsageError(f"{where}.path: expected a name that ends in {suffix}, found {_shown(str(output.path))}")
-    options = {key: whole(value) for key, value in {**output.options, **options}.items()}
+    given = {**output.options, **options}
+    options = {key: whole(value) for key, value in given.items()}
     known = make_output(output.path, output.kind)
     for name in sorted(set(options) & set(known.options)):
         expected = type(known.options[name])
         if not isinstance(options[name], expected):
             kind = "a whole number" if expected is int else "a text"
-            raise UsageError(f"{where}.{name}: expected {kind}, found {_shown(options[name])}")
+            raise UsageError(f"{where}.{name}: expected {kind}, found {_shown(given[name])}")
     try:
         return make_output(output.path, output.kind, **options)
     except UsageError as error:

@@ -226,7 +226,7 @@ def _frechet(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> float:
 
 
 def _gram_distance(exemplar: list[Tensor], other: list[Tensor]) -> float:
-    """The mean over layers of Gram matrices' relative differences. Relative to the exemplar's: not the same the other way round."""
+    """The mean over layers of Gram matrices' differences, relative to the exemplar's: the other way round it is another one."""
     return float(np.mean([float(gram_difference(a, b, relative=True)) for a, b in zip(exemplar, other, strict=True)]))
 
 

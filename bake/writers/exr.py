@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.bake.color import LINEAR, LUMA, SRGB, as_floats, to_linear
-from solidgrain.bake.frames import frame_paths
+from solidgrain.bake.frames import PATTERN, frame_paths
 from solidgrain.bake.store import Encoded, Finished, Store
 from solidgrain.bake.writers.base import ROUNDING, FloatArray, Option, Output, Volume, Writer
 from solidgrain.bake.writers.exr_zip import LINES, deflated, isal_zlib
@@ -31,7 +31,7 @@ COMPRESSIONS = ("none", "zip", "zips", "piz", "dwaa")
 OPTIONS = (
     Option("type", "half", "of the channels", tuple(TYPES)),
     Option("compression", "zip", "dwaa is lossy", COMPRESSIONS),
-    Option("channels", "R=r,G=g,B=b", "names, each with what it holds: r, g, b, luma or one, as in R=r,G=g,B=b,height=luma"),
+    Option("channels", "R=r,G=g,B=b", "what each holds: r, g, b, one, luma (of linear light), as in R=r,G=g,B=b,height=luma"),
     Option("axis", "z", "across which the slices lie", ("x", "y", "z")),
     Option("start", 1, "number of the first slice"),
 )
@@ -145,15 +145,18 @@ def parse_channels(output: Output) -> dict[str, str]:
     text = str(output.options["channels"])
     pairs = [part.partition("=") for part in text.split(",")]
     channels = {name.strip(): source.strip() for name, _, source in pairs}
-    if len(channels) != len(pairs) or not all(channels) or not set(channels.values()) <= set(SOURCES):
+    if len(channels) != len(pairs) or not all(channels) or not text.isprintable() or not set(channels.values()) <= set(SOURCES):
+        shown = text if text.isprintable() else ascii(text)
         raise UsageError(
-            f"--exr-channels {text}: expected NAME=SOURCE,... with each name once and sources from {', '.join(SOURCES)}"
+            f"--exr-channels {shown}: expected NAME=SOURCE,... with each name once and sources from {', '.join(SOURCES)}"
         )
     return channels
 
 
 def check(output: Output, volume: Volume) -> None:
     parse_channels(output)
+    if output.options["start"] != 1 and not PATTERN.search(output.path.name):
+        raise UsageError(f"--exr-start {output.options['start']}: {output.path.name} has no frame number; leave it out")
 
 
 def files(output: Output, volume: Volume) -> list[Path]:

@@ -197,6 +197,12 @@ def rounds(output: Output) -> bool:
     return clips(output) or output.options.get("type") in BLOCKS
 
 
+def may_round(kind: str) -> bool:
+    """Whether a format has a type that `rounds`."""
+    types = [choice for option in formats()[kind].options if option.name == "type" for choice in option.choices]
+    return kind == ".atlas.png" or any(choice in (*WHOLE_NUMBERS, *BLOCKS) for choice in types)
+
+
 BLOCKS = ("bc1", "bc7")
 WHOLE_NUMBERS = ("uint8", "uint16", "rgba8")
 HALVES = ("half", "rgba16f")

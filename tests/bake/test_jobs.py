@@ -109,8 +109,32 @@ def test_defaults_are_for_the_jobs_that_have_a_use_for_them(solidgrain, write_jo
     preview = {"name": "a", "preview": "a.png"}
     path = write_jobs(preview, mips=True, mip_filter="box", colorspace="ACEScg", dither=True, **{"for": "unity"})
     assert solidgrain("bake", "--jobs", path, "--quiet").code == 0
+    lengths = {"mips": True, "mip_filter": "kaiser", "patch_scale": 2, "box": [0, 0, 0, 3, 3, 3]}
+    path = write_jobs({"name": "c", "out": "c.vti", "mips": False, "spacing": 2}, {"name": "d", "out": "d.vti"}, **lengths)
+    assert solidgrain("bake", "--jobs", path, "--quiet").code == 0
+    assert (path.parent / "d.mip1.vti").exists()
+    assert not (path.parent / "c.mip1.vti").exists()
     path = write_jobs({"name": "a", "out": "a.vti", "exr_compression": "piz"})
     assert "jobs[0] 'a': exr_compression: no out of this format; leave it out" in solidgrain("bake", "--jobs", path).error
+
+
+@pytest.mark.parametrize(
+    ("job", "message"),
+    [
+        ({"out": "a.vti", "mips": "kaiser"}, 'mips: expected true or false, found "kaiser"'),
+        ({"out": "a.vti", "dither": 1}, "dither: expected true or false, found 1"),
+        ({"out": "a.vti", "vti_type": False}, "vti_type: expected a value, found false"),
+        ({"out": "a.vti", "colorspace": False}, "colorspace: expected a value, found false"),
+        ({"out": {"path": "a.vti", "mips": True}}, "mips: expected a text, found true"),
+        ({"out": "a.####.exr", "dither": True}, "dither: no out of whole numbers; leave it out"),
+        ({"out": {"path": "a.exr"}, "size": [4, 4, 1], "exr_start": 5}, "exr_start 5: a.exr has no frame number; leave it out"),
+        ({"out": "a.####.exr", "exr_channels": "\x07=r"}, "exr_channels '\\x07=r': expected NAME=SOURCE"),
+        ({"out": "a.vti", "colorspace": "\x07"}, "colorspace '\\x07': expected printable characters"),
+    ],
+)
+def test_a_value_that_makes_no_sense_is_shown_as_it_was_given(solidgrain, write_jobs, job, message):
+    outcome = solidgrain("bake", "--jobs", write_jobs({"name": "a", **job}))
+    assert (outcome.code, message in outcome.error) == (2, True), outcome.error
 
 
 def test_an_outputs_own_engine_turns_its_axes(solidgrain, write_jobs, tmp_path):
