@@ -35,6 +35,13 @@ def parse_spacing(text: str) -> tuple[float, float, float]:
     return spacing
 
 
+def parse_text(text: str) -> str:
+    """What goes into files and model cards."""
+    if not text.isprintable():
+        raise argparse.ArgumentTypeError(f"expected printable characters in UTF-8, found {text!a}")
+    return text
+
+
 def parse_tile(text: str) -> str:
     if not set(text) <= set("xyz") or len(set(text)) != len(text):
         raise argparse.ArgumentTypeError(f"expected each of x, y, z at most once, found {text!r}")

@@ -110,7 +110,7 @@ def summary(name: str, bundle: Bundle, found: Found | None) -> tuple[str, ...]:
     """A texture's row in the first table."""
     said = exemplar_of(bundle)
     ranges = [f"{min(means):.2f} to {max(means):.2f}" for means in means_of(found)] if found else ["–", "–"]
-    copying = f"{found['copying']['ratio']:.2f}, {100 * found['copying']['closer']:.1f} %" if found else "–"
+    copying = Copying(**found["copying"]).said() if found else "–"
     stated = (said[key] or "not stated" for key in ("license", "credit"))
     return f"[{name}](#{name})", f"`{said['exemplar']}`", *stated, *ranges, copying
 

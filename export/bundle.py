@@ -32,7 +32,7 @@ from solidgrain.runtime.bundle import (
     file_sha256,
 )
 from solidgrain.runtime.errors import BundleError
-from solidgrain.runtime.files import sync, temporary_name
+from solidgrain.runtime.files import exchanged, sync, temporary_name
 from solidgrain.runtime.lattice import untiled
 from solidgrain.runtime.noise import noise_offsets, noise_tables
 from solidgrain.runtime.probe import probe_patch
@@ -97,6 +97,10 @@ def write_bundle(
     parts = {MANIFEST, SAMPLER, TEXTURE, CARD, ENCODER, MAPPING, BLEND, CRITIC}
     if folder.exists() and (strange := {path.name for path in folder.iterdir()} - parts):
         raise BundleError(f"{folder}: holds {', '.join(sorted(strange))}, which is no part of a bundle; move it away first")
+    if not details.name.isprintable():
+        raise BundleError(
+            f"{folder}: {details.name!r} is no name for a texture; give it one of printable characters with --name"
+        )
     folder = folder.resolve()
     building = temporary_name(folder)
     former = building.with_suffix(".old")
@@ -106,9 +110,10 @@ def write_bundle(
         add(building)
         for path in building.iterdir():
             sync(path)
-        if folder.exists():
-            folder.rename(former)
-        building.rename(folder)
+        if not (folder.exists() and exchanged(building, folder)):
+            if folder.exists():
+                folder.rename(former)
+            building.rename(folder)
     except OSError as error:
         raise BundleError(f"{folder}: cannot write the bundle ({error.strerror})") from error
     finally:

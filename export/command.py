@@ -7,13 +7,14 @@ import json
 import shlex
 from pathlib import Path
 
-from solidgrain.bake.messages import tell
+from solidgrain.bake.arguments import parse_text
+from solidgrain.bake.messages import tell, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="a folder made by solidgrain train")
     parser.add_argument("--out", type=Path, required=True, metavar="BUNDLE", help="the bundle folder to write")
-    parser.add_argument("--name", default="", help="name of the texture (default: the bundle folder's name)")
+    parser.add_argument("--name", type=parse_text, default="", help="name of the texture (default: the bundle folder's name)")
     parser.add_argument("--overwrite", action="store_true", help="replace the bundle if it exists")
     parser.add_argument(
         "--companion", action="store_true", help="of a space: write its critic as well, which solidgrain adapt needs"
@@ -24,13 +25,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from solidgrain.export.from_run import export_run
     from solidgrain.export.from_space_run import export_space_run
-    from solidgrain.runtime.bundle import open_bundle
+    from solidgrain.runtime.bundle import CRITIC, open_bundle
     from solidgrain.runtime.errors import UsageError
     from solidgrain.train.run import is_space
 
     common, space = (arguments.run, arguments.out, arguments.name, arguments.overwrite), is_space(arguments.run)
     if arguments.companion and not space:
         raise UsageError(f"--companion: adapting needs a texture space, {arguments.run} is one texture's run; leave it out")
+    companion = arguments.out / CRITIC
+    if arguments.overwrite and companion.is_file() and not arguments.companion:
+        warn(f"{companion}: is not written anew without --companion, and solidgrain adapt needs it")
     folder = export_space_run(*common, arguments.companion) if space else export_run(*common)
     if arguments.json:
         print(json.dumps(open_bundle(folder).manifest, indent=2))

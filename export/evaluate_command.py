@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 
 from solidgrain.bake.arguments import parse_count, parse_positive, parse_scale
-from solidgrain.bake.messages import tell
+from solidgrain.bake.checks import check_folder
+from solidgrain.bake.messages import tell, warn
 from solidgrain.runtime.errors import UsageError
 
 SHEETS = (".png", ".html")
@@ -37,13 +38,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     import torch
 
-    from solidgrain.export.evaluation import exemplar_scale, grain_of, measure, write_quality
+    from solidgrain.export.evaluation import exemplar_scale, grain_of, is_exemplar, measure, write_quality
     from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load_texture
     from solidgrain.runtime.blend_file import BlendData
+    from solidgrain.runtime.bundle import CARD
     from solidgrain.runtime.workers import usable_threads
     from solidgrain.train.inception import Inception
-    from solidgrain.train.photograph import read_exemplar
+    from solidgrain.train.photograph import read_photograph, scaled
     from solidgrain.train.quality import SMALLEST
     from solidgrain.train.run import pixels_sha256
 
@@ -54,10 +56,20 @@ def run(arguments: argparse.Namespace) -> int:
     texture = load_texture(arguments.source, bundle=arguments.bundle, threads=arguments.threads)
     if isinstance(texture.data, BlendData):
         raise UsageError(f"{arguments.source}: is a blend in space, which has no exemplar of its own; evaluate its ends")
+    if arguments.card:
+        check_folder(texture.bundle.folder / CARD)
     if arguments.card and texture.bundle.is_space:
         raise UsageError(f"--card: {texture.bundle.name} is a space, its card not that of one texture; leave --card out")
     scale = arguments.patch_scale or exemplar_scale(texture)
-    exemplar = read_exemplar(arguments.exemplar, SMALLEST, scale, "use a larger photograph or a smaller --patch-scale")
+    smaller = "use a larger photograph or a smaller --patch-scale"
+    photograph = read_photograph(arguments.exemplar, round(SMALLEST * scale), smaller).pixels
+    if not texture.bundle.is_space and not is_exemplar(texture.bundle, photograph):
+        if arguments.card:
+            raise UsageError(
+                f"--card: {texture.name} was not learned from {arguments.exemplar}, by its pixels; leave --card out"
+            )
+        warn(f"{arguments.exemplar}: {texture.name} was not learned from it, by its pixels")
+    exemplar = scaled(photograph, scale)
     reduced = "" if scale == 1 else f", of whose pixels {scale:g}x{scale:g} are one"
     tell(f"measuring {2 * arguments.slices} slices of {texture.name} against {arguments.exemplar}{reduced}")
     found = measure(texture, exemplar, arguments.slices, inception, tell)
@@ -87,3 +99,6 @@ def check_sheet(sheet: Path, exemplar: Path) -> None:
         raise UsageError(f"--sheet {sheet}: no folder {sheet.parent}; make it first")
     if sheet.exists() and exemplar.exists() and sheet.samefile(exemplar):
         raise UsageError(f"--sheet {sheet}: is the exemplar itself; choose another name")
+    if sheet.is_dir():
+        raise UsageError(f"--sheet {sheet}: is a folder; choose another name")
+    check_folder(sheet)

@@ -16,7 +16,9 @@ from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.copying import Copying, Pair, measure_copying
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
+from solidgrain.train.photograph import scaled
 from solidgrain.train.quality import Evaluation, evaluate
+from solidgrain.train.run import pixels_sha256
 
 
 class Measured(NamedTuple):
@@ -37,6 +39,21 @@ class Measured(NamedTuple):
 def grain_of(bundle: Bundle) -> str:
     """The axis about which slices were turned in training, or "none"."""
     return str(bundle.manifest["training"].get("settings", {}).get("grain", "none"))
+
+
+def exemplar_of(bundle: Bundle) -> dict[str, str]:
+    """What the manifest says of the one photograph that a texture was learned from: file name, licence, credit, sha256."""
+    entries = bundle.manifest["training"].get("exemplars", [])
+    unknown = dict.fromkeys(("exemplar", "license", "credit", "sha256", "photograph_sha256"), "")
+    return {**unknown, **(entries[0] if len(entries) == 1 else {})}
+
+
+def is_exemplar(bundle: Bundle, photograph: FloatArray) -> bool:
+    """Whether a texture was learned from a photograph [H, W, 3], by its pixels; True if its bundle does not say from which."""
+    said = exemplar_of(bundle)
+    if said["photograph_sha256"]:  # of one that was reduced, which rounds as the processor does
+        return pixels_sha256(photograph) == said["photograph_sha256"]
+    return said["sha256"] in ("", pixels_sha256(scaled(photograph, scale_of(bundle))))
 
 
 def scale_of(bundle: Bundle) -> float:

@@ -49,7 +49,16 @@ def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
         f"{evaluation.crop}² pixels, through the runtime:",
         ("measure", "floor", *turned, "axis-aligned slices", "oblique slices", *among),
         rows,
+        f"{about(copying)}{change * uneven}",
+    )
+
+
+def about(copying: Copying) -> str:
+    """Whether the exemplar was copied, in a sentence."""
+    if copying.ratio is None or copying.closer is None:
+        return "Copying: cannot be told of an exemplar whose halves hold the same; evaluate with one period of it."
+    return (
         f"Copying: patches are {copying.ratio:.2f} times as far from the exemplar as its halves are from each other, and "
         f"{100 * copying.closer:.1f} % of {copying.patches} come nearer than 99 % of those do "
-        f"(near 1 and 1 %: nothing is copied).{change * uneven}",
+        "(near 1 and 1 %: nothing is copied)."
     )

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive, parse_scale, parse_seed
+from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive, parse_scale, parse_seed, parse_text
 from solidgrain.bake.messages import tell, warn
 from solidgrain.runtime.errors import TrainingError, UsageError
 from solidgrain.train.console import Progress, StopRequest
@@ -87,8 +87,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--precision", choices=("auto", "float32", "bfloat16"), help="of plain forward passes (auto)")
     add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (auto)")
     add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
-    add("--license", metavar="TEXT", help="the photograph's licence, for the model card")
-    add("--credit", metavar="TEXT", help="whom to credit, for the model card")
+    add("--license", type=parse_text, metavar="TEXT", help="the photograph's licence, for the model card")
+    add("--credit", type=parse_text, metavar="TEXT", help="whom to credit, for the model card")
     add("--quiet", action="store_true", help="no progress on stderr")
 
 
@@ -131,6 +131,7 @@ def train_together(arguments: argparse.Namespace, device: torch.device, processe
 
 def train_on(training: RunFolder, arguments: argparse.Namespace, device: torch.device, processes: Processes) -> int:
     from solidgrain.train.loop import train
+    from solidgrain.train.run import CHECKPOINT
 
     stop = StopRequest(quiet=not processes.first)
     progress = Progress(training.budget, arguments.quiet, describe)
@@ -139,8 +140,10 @@ def train_on(training: RunFolder, arguments: argparse.Namespace, device: torch.d
     stopped = processes.any(stop.requested())
     progress.end()
     if processes.first:
-        tell(how_to_go_on(training, stopped, ending, budget_flags(arguments)))
-    return INTERRUPTED if stopped else 0
+        tell(how_to_go_on(training, stopped, ending, budget_flags(arguments), processes))
+    if stopped:
+        return INTERRUPTED
+    return 0 if (training.folder / CHECKPOINT).exists() else FAILED
 
 
 def describe(report: Report, done: float, left: float) -> str:
@@ -150,14 +153,15 @@ def describe(report: Report, done: float, left: float) -> str:
     )
 
 
-def how_to_go_on(training: RunFolder, stopped: bool, ending: Ending, flags: str) -> str:
+def how_to_go_on(training: RunFolder, stopped: bool, ending: Ending, flags: str, processes: Processes) -> str:
     from solidgrain.train.run import CHECKPOINT
 
     folder = training.folder
     named = shlex.quote(str(folder))
     done = f"done after {ending.iteration} iterations" if training.budget.until_plateau else "done"
     if stopped:
-        return f"stopped{' and saved' * ending.saved}; go on with: solidgrain train --resume {named}{flags}"
+        together = f" in {processes.count} processes, each" if processes.count > 1 else ""
+        return f"stopped{' and saved' * ending.saved}; go on{together} with: solidgrain train --resume {named}{flags}"
     if not (folder / CHECKPOINT).exists():
         return f"{folder}: {done}, and nothing is worth keeping; train again with another --seed"
     if training.settings.noise_at_input:
@@ -252,17 +256,21 @@ def about_uneven(run: SpaceRun) -> str:
 def about_seen(run: SpaceRun, warm_start: Path | None) -> str:
     """Which held-out photographs the weights that this run begins with were trained on, as far as is known, or ""."""
     from solidgrain.runtime.bundle import embedded_folder, open_bundle
-    from solidgrain.train.run import is_space, pixels_sha256
-    from solidgrain.train.space_run import open_space_run
+    from solidgrain.train.run import pixels_sha256
+    from solidgrain.train.space_run import SpaceRun
 
-    if warm_start:
-        known = open_space_run(warm_start).trained_on if warm_start.is_dir() and is_space(warm_start) else []
-        seen = {pixels_sha256(member.pixels) for member in known}
-    elif run.settings.critic_start:
-        manifest = open_bundle(embedded_folder(run.settings.critic_start)).manifest
-        seen = {entry["sha256"] for entry in manifest["training"].get("exemplars", [])}
-    else:
-        seen = set()
+    seen: set[str] = set()
+    start = run.settings.critic_start if not warm_start else ""
+    if warm_start and warm_start.is_dir():
+        other = open_any(warm_start)
+        start = other.settings.critic_start  # what that run began with has come along
+        if isinstance(other, SpaceRun):
+            seen = {pixels_sha256(member.pixels) for member in other.trained_on}
+    elif warm_start and run.held_out:
+        return f"--warm-start {warm_start}: what it was trained on is not known; held-out photographs may be among it"
+    if start:
+        manifest = open_bundle(embedded_folder(start)).manifest
+        seen |= {entry["sha256"] for entry in manifest["training"].get("exemplars", [])}
     names = sorted(
         member.name for member in run.members if member.name in run.held_out and pixels_sha256(member.pixels) in seen
     )
@@ -355,11 +363,18 @@ def with_grain(settings: Settings, anisotropic: str | None, exemplar: Any) -> Se
 
 def resume(arguments: argparse.Namespace) -> RunFolder:
     """The run to go on with, under its own settings; --iterations, --minutes and --until-plateau replace its budget."""
+    from solidgrain.train.run import CHECKPOINT
+
     if arguments.exemplar is not None:
         raise UsageError(f"--resume {arguments.resume}: the run has its exemplar already; leave {arguments.exemplar} out")
     if given := [f"--{name.replace('_', '-')}" for name in FIXED if getattr(arguments, name) is not None]:
         raise UsageError(f"--resume {arguments.resume}: the run has settled {', '.join(given)} already; leave them out")
     training = open_any(arguments.resume)
+    if training.settings.warm_start and not (arguments.resume / CHECKPOINT).exists():
+        raise TrainingError(
+            f"--resume {arguments.resume}: was stopped before it had the weights of {training.settings.warm_start}; remove it, "
+            "and begin again with --warm-start"
+        )
     if arguments.iterations is None and arguments.minutes is None and not arguments.until_plateau:
         return training
     return replace(training, budget=make_budget(arguments, training.settings))

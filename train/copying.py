@@ -24,7 +24,7 @@ SLICES, SLICE = 16, 64  # half of them axis-aligned, half oblique; pixels along 
 MOST, FEWEST = 256, 32  # patches that are compared, for exemplars up to 512² pixels and for very large ones
 SHOWN = 8  # the nearest pairs, for looking at
 BAND = 2**22  # numbers held at a time
-SMALLEST_FLOOR = 1 / 1020  # a quarter of an 8-bit level: exemplars that repeat themselves have a floor of zero
+SMALLEST_FLOOR = 1 / 1020  # a quarter of an 8-bit level: exemplars that repeat themselves have less
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,13 @@ class Copying:
 
     patches: int  # compared, half of axis-aligned slices and half of oblique ones
     floor: float  # median distance from patches of one half of the exemplar to their nearest in the other half
-    ratio: float  # median distance of the texture's patches, over the floor: near or above 1 is no copying
-    closer: float  # share of the texture's patches that are nearer than 99 % of the floor's: near 0.01 is no copying
+    # Of an exemplar that repeats itself, whose halves hold the same, neither can be told: None.
+    ratio: float | None  # median distance of the texture's patches, over the floor: near or above 1 is no copying
+    closer: float | None  # share of the texture's patches that are nearer than 99 % of the floor's: near 0.01 is no copying
+
+    def said(self) -> str:
+        """In a few words."""
+        return "–" if self.ratio is None or self.closer is None else f"{self.ratio:.2f}, {100 * self.closer:.1f} %"
 
 
 class Pair(NamedTuple):
@@ -58,8 +63,10 @@ def measure_copying(exemplar: FloatArray, sample: Sample, grain: str = "none") -
     generator = torch.Generator().manual_seed(2)
     halves = [(first, _patches(second, count // 2, generator)), (second, _patches(first, count // 2, generator))]
     floor = torch.cat([search(half, patches, grain)[0] for half, patches in halves])
-    median = max(float(floor.median()), SMALLEST_FLOOR)
+    median = float(floor.median())
     pairs = [Pair(_as_array(made[i]), _as_array(nearest[i]), float(found[i])) for i in found.argsort()[:SHOWN].tolist()]
+    if median < SMALLEST_FLOOR:
+        return Copying(count, median, None, None), pairs
     closer = float((found < floor.quantile(0.01)).float().mean())
     return Copying(count, median, float(found.median()) / median, closer), pairs
 

@@ -224,7 +224,7 @@ class Trainer:
             self.watch = Watch(**state.get("watch", {}))  # runs of earlier versions have none
             self.plateau = Plateau(**state.get("plateau", {}))
         except (RuntimeError, ValueError, TypeError) as error:
-            reason = str(error).splitlines()[0]
+            reason = str(error).splitlines()[-1].strip()  # of torch's, the first only names the class
             raise TrainingError(f"{self.run.folder}: the checkpoint does not fit the run or --device ({reason})") from error
         self.iteration, self.seconds = state["iteration"], state["seconds"]
         self.setbacks = state.get("setbacks", 0)
@@ -327,7 +327,8 @@ def train(
         trainer.save()
     if processes.first:
         if doubt:
-            on_warning(f"iteration {trainer.iteration} is not saved ({doubt}); the last checkpoint stays")
+            stays = "; the last checkpoint stays" if (run.folder / CHECKPOINT).exists() else ""
+            on_warning(f"iteration {trainer.iteration} is not saved ({doubt}){stays}")
         _write_sample(trainer)
     return Ending(trainer.iteration, not doubt, report)
 

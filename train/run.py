@@ -97,7 +97,7 @@ class RunFolder:
         except OSError as error:
             raise TrainingError(
                 f"{self.folder / name}: cannot write ({error.strerror}); the last checkpoint is whole: "
-                f"make space and go on with --resume {shlex.quote(str(self.folder))}"
+                f"make space and go on with --resume {shlex.quote(str(self.folder))} and the budget that was given, if one was"
             ) from error
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from solidgrain.train.contrast import FAINTEST
 from solidgrain.train.layers import Linear, activate
 from solidgrain.train.noise import Noise, look_up
 from solidgrain.train.settings import Settings
@@ -57,7 +58,7 @@ class Octaves(nn.Module):
         """
         variances, axes = torch.linalg.eigh(covariance.double())
         deviations = variances.clamp(min=0).sqrt()
-        deviations = deviations.clamp(min=NARROWEST * float(deviations.max()))
+        deviations = deviations.clamp(min=NARROWEST * max(float(deviations.max()), FAINTEST))
         self.color_mean = mean.float()
         self.color_axes = (deviations[:, None] * axes.T).float()
 

@@ -69,6 +69,6 @@ def flaw(networks: Iterable[nn.Module], colors: Tensor, exemplars: Sequence[Tens
         return "a weight is not finite"
     wanted = float(torch.stack([exemplar.flatten(1).std(-1).mean() for exemplar in exemplars]).mean())
     found = float(colors.std(1).mean())
-    if found < FLAT * wanted:
+    if not found >= FLAT * wanted:  # NaN is none either
         return f"the average has collapsed: its colours deviate by {found:.2g}, the exemplar's by {wanted:.2g}"
     return ""

@@ -30,7 +30,7 @@ def unpacked_reference(content):
     magic, length = HEADER.unpack_from(content)
     assert magic == MAGIC
     each = -(-length // 4)
-    body = content[HEADER.size :]
+    body = content[HEADER.size + 4 :]
     planes = [body[place * each : (place + 1) * each] for place in range(3)] + [zlib.decompress(body[3 * each :])]
     return bytes(planes[place % 4][place // 4] for place in range(length))
 
@@ -39,6 +39,21 @@ def unpacked_reference(content):
 def test_packing_loses_nothing_whatever_the_length(length):
     content = np.random.default_rng(length).bytes(length)
     assert unpack(pack(content)) == unpacked_reference(pack(content)) == content
+
+
+def test_a_changed_byte_anywhere_is_an_error():
+    content, draw = pack(np.random.default_rng(0).bytes(1000)), np.random.default_rng(1)
+    for place in range(8, len(content)):
+        changed = bytearray(content)
+        changed[place] ^= int(draw.integers(1, 256))
+        with pytest.raises((ValueError, zlib.error)):
+            unpack(bytes(changed))
+
+
+def test_files_of_earlier_versions_are_read():
+    content = np.random.default_rng(0).bytes(1000)
+    packed = pack(content)
+    assert unpack(b"SGTRAIN1" + packed[8:16] + packed[20:]) == content
 
 
 def test_what_was_never_packed_is_left_as_it_is():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from solidgrain.export.figures import about
 from solidgrain.train.copying import SHOWN, SIDE, measure_copying, search
 from solidgrain.train.cuts import as_image
 from tests.train.conftest import blotches
@@ -95,11 +96,14 @@ def test_pairs_are_the_nearest_of_all_in_order():
         assert pair.distance == pytest.approx(float(np.sqrt(((pair.patch - pair.nearest) ** 2).mean())), rel=1e-5)
 
 
-def test_an_exemplar_that_repeats_itself_has_a_floor_all_the_same():
-    tiles = np.tile(blotches(16, 16), (8, 8, 1))
-    copying, _ = measure_copying(tiles, crops_of(REST))
-    assert np.isfinite(copying.ratio)
-    assert copying.closer == 0
+@pytest.mark.parametrize("texture", [REST, EXEMPLAR])
+def test_of_an_exemplar_that_repeats_itself_copying_cannot_be_told(texture):
+    """Each half holds all of the other: what is as far from it as they are from each other is a copy, too."""
+    tiles = np.tile(EXEMPLAR[:16, :16], (8, 8, 1))
+    copying, pairs = measure_copying(tiles, crops_of(texture))
+    assert (copying.ratio, copying.closer, copying.said()) == (None, None, "–")
+    assert len(pairs) == SHOWN
+    assert "cannot be told" in about(copying)
 
 
 def test_the_largest_search_is_done_in_bands_with_the_same_result(monkeypatch):

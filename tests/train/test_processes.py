@@ -159,7 +159,9 @@ def test_the_command_line_makes_one_run_for_both_processes_and_says_so_once(fold
 def test_an_interrupt_of_any_process_stops_all_of_them_at_one_iteration(folder, found):
     assert [process["interrupted"] for process in found] == [130, 130]
     stopped = said((folder / "stderr").read_text())[3:]
-    assert stopped == [f"stopped and saved; go on with: solidgrain train --resume {folder}/run --iterations 1000"]
+    assert stopped == [
+        f"stopped and saved; go on in 2 processes, each with: solidgrain train --resume {folder}/run --iterations 1000"
+    ]
     assert open_space_run(folder / "run").load_checkpoint()["iteration"] == 3
 
 
@@ -191,7 +193,7 @@ def test_a_signal_to_torchrun_stops_both_processes_and_leaves_a_checkpoint(tmp_p
     assert process.returncode != 0
     assert said(stderr) == [
         "finishing this iteration; once more to stop at once",
-        f"stopped and saved; go on with: solidgrain train --resume {folder} --iterations 10000",
+        f"stopped and saved; go on in 2 processes, each with: solidgrain train --resume {folder} --iterations 10000",
     ]
     state = open_space_run(folder).load_checkpoint()
     assert len(state["other_generators"]) == 1

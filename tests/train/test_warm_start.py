@@ -202,3 +202,13 @@ def test_kinds_of_runs_and_of_samplers_may_differ(tmp_path, photograph, given, w
     warm_start(space, learned(single.folder), CPU)
     layer = single.load_checkpoint()["average"]["hidden.1.weight"]
     torch.testing.assert_close(space.load_checkpoint()["average"]["sampler.hidden.1.weight"], layer)
+
+
+def test_a_run_that_was_killed_before_it_had_the_weights_is_not_resumed_without_them(single, space, tmp_path, solidgrain):
+    out = tmp_path / "new"
+    stones = photographs(tmp_path / "stones", 2)
+    assert solidgrain("train", "--space", stones, "--out", out, "--warm-start", single.folder, *FLAGS).code == 0
+    (out / "checkpoint.pt").unlink()
+    outcome = solidgrain("train", "--resume", out, "--threads", 1)
+    assert outcome.code == 1
+    assert f"{out}: was stopped before it had the weights of single" in outcome.error
