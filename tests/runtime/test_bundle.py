@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from solidgrain.export import bundle as bundle_module
 from solidgrain.export.bundle import Details, write_bundle
 from solidgrain.runtime import BundleError, EvaluationError, ProviderError, embedded_names, load
-from solidgrain.runtime.bundle import file_sha256
+from solidgrain.runtime.bundle import file_sha256, open_bundle
+from solidgrain.runtime.files import exchanged
 from solidgrain.runtime.texture_file import TextureData, read_texture, write_texture
 from tests.toy import toy_weights
 
@@ -256,11 +258,23 @@ def test_a_bundle_that_cannot_be_replaced_stays(tmp_path, monkeypatch, where):
         return fail() if where == "rename" and path.name.endswith(".tmp") else rename(path, target)
 
     monkeypatch.setattr(Path, "rename", rename)
+    monkeypatch.setattr(bundle_module, "exchanged", lambda *_: False)  # as where the system cannot
     more = {"add": fail} if where == "add" else {}
     with pytest.raises(BundleError, match="No space left"):
         write_bundle(folder, toy_weights(seed=2), Details(name="toy", patch=64), overwrite=True, **more)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["toy"]
+
+
+def test_a_bundle_that_is_replaced_is_never_away(tmp_path, monkeypatch):
+    folder = write_bundle(tmp_path / "toy", toy_weights(seed=1), Details(name="toy", patch=64))
+    if not exchanged(folder, shutil.copytree(folder, tmp_path / "copy")):
+        pytest.skip("this system has no renameat2")
+    shutil.rmtree(tmp_path / "copy")
+    monkeypatch.setattr(Path, "rename", None)  # whatever moves it away would fail
+    write_bundle(folder, toy_weights(seed=2), Details(name="other", patch=64), overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["toy"]
+    assert open_bundle(folder).name == "other"
 
 
 def test_a_space_is_a_bundle_itself():
