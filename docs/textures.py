@@ -16,6 +16,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from docs.embedded import EXEMPLARS, HERE, embedded_textures, exemplar_of, find_photograph, say
 from solidgrain.bake.arguments import parse_count, parse_positive
 from solidgrain.export.evaluation import grain_of, measure, write_quality
@@ -23,6 +25,7 @@ from solidgrain.export.figures import Figures, make_figures
 from solidgrain.runtime import SolidgrainError, UsageError, load_texture
 from solidgrain.runtime.bundle import Bundle
 from solidgrain.runtime.files import replacing
+from solidgrain.runtime.workers import usable_threads
 from solidgrain.train.copying import Copying
 from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
 from solidgrain.train.quality import Evaluation
@@ -47,6 +50,7 @@ HEADER = ("texture", "photograph", "licence", "credit", "axis-aligned", "oblique
 def main(argv: Sequence[str] | None = None) -> None:
     arguments = parse(argv)
     find_weights()
+    torch.set_num_threads(arguments.threads or usable_threads())
     bundles = embedded_textures()
     found = kept(arguments.out / DATA, bundles)
     names = chosen(arguments.only, bundles)
