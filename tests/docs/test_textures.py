@@ -120,7 +120,9 @@ def test_textures_are_measured_as_solidgrain_evaluate_does(made, monkeypatch, so
     run(made, monkeypatch, "--only", "planks")
     check_figures(made, "planks")
     exemplar = made / "photographs" / "folder 1" / "planks.png"
-    outcome = solidgrain("evaluate", made / "embedded" / "planks", "--exemplar", exemplar, "--slices", 1, "--json")
+    outcome = solidgrain(
+        "evaluate", made / "embedded" / "planks", "--exemplar", exemplar, "--slices", 1, "--threads", 1, "--json"
+    )
     figures = found(made)["planks"]
     assert figures.pop("files").keys() == {"sampler.onnx", "texture.sgt.npz"}
     evaluated = json.loads(outcome.out)
