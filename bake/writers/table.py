@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from solidgrain.bake.color import HALF_LARGEST, LINEAR, SRGB, color_options
@@ -27,6 +28,7 @@ class Format:
     files: Callable[[Output, Volume], list[Path]] = lambda output, volume: [output.path]
     options: tuple[Option, ...] = ()
     scratch: Callable[[Output], int] = lambda output: 0  # bytes per voxel that its staging holds besides the final files
+    sample_type: str = "float"  # what it holds, unless its option `type` says so
     linear_types: tuple[str, ...] = ()  # of its option `type`, those whose colours are linear instead: no header says sRGB
     levels_inside: bool = False  # mip levels are in the file itself
     check: Callable[[Output, Volume], None] = lambda output, volume: None  # raises UsageError or BakeError
@@ -36,11 +38,16 @@ def formats() -> dict[str, Format]:
     """Formats import their libraries when they are opened, so the whole table costs nothing."""
     from solidgrain.bake.writers import atlas, dds, exr, npy, preview, raw, vdb, vti
 
-    def atlas_of(colorspace: str) -> Format:
-        return Format(
-            "atlas", atlas.AtlasFile, atlas.size, colorspace, atlas.files, atlas.OPTIONS, atlas.scratch, check=atlas.check
-        )
-
+    atlas_of = partial(
+        Format,
+        "atlas",
+        atlas.AtlasFile,
+        atlas.size,
+        files=atlas.files,
+        options=atlas.OPTIONS,
+        scratch=atlas.scratch,
+        check=atlas.check,
+    )
     return {
         ".exr": Format("exr", exr.ExrStack, exr.size, LINEAR, exr.files, exr.OPTIONS, check=exr.check),
         ".vti": Format("vti", vti.VtiFile, vti.size, SRGB, options=vti.OPTIONS),
@@ -57,8 +64,8 @@ def formats() -> dict[str, Format]:
             check=dds.check,
         ),
         ".raw": Format("raw", raw.RawFile, raw.size, SRGB, raw.files, raw.OPTIONS),
-        ".atlas.png": atlas_of(SRGB),
-        ".atlas.exr": atlas_of(LINEAR),
+        ".atlas.png": atlas_of(SRGB, sample_type="uint8"),
+        ".atlas.exr": atlas_of(LINEAR, sample_type="half"),
         PREVIEW: Format("preview", preview.PreviewFile, preview.size, SRGB),
     }
 
@@ -181,26 +188,31 @@ def output_exists(output: Output, volume: Volume) -> bool:
 
 def clips(output: Output) -> bool:
     """Whether the files of an output hold whole numbers, which have no room for colours outside [0, 1]."""
-    return str(output.options.get("type", "uint8" if output.kind == ".atlas.png" else "float")) in WHOLE_NUMBERS
+    return _sample_type(output) in WHOLE_NUMBERS
 
 
 def bounds(output: Output) -> tuple[float, float]:
     """The least and the greatest colour that its files can hold."""
     if clips(output):
         return 0.0, 1.0
-    half = output.options.get("type") in HALVES or output.kind == ".atlas.exr"
-    return (-float(HALF_LARGEST), float(HALF_LARGEST)) if half else (-math.inf, math.inf)
+    largest = float(HALF_LARGEST) if _sample_type(output) in HALVES else math.inf
+    return -largest, largest
 
 
 def rounds(output: Output) -> bool:
     """Whether its colours become whole numbers, blocks of them included: what dither is for."""
-    return clips(output) or output.options.get("type") in BLOCKS
+    return _sample_type(output) in (*WHOLE_NUMBERS, *BLOCKS)
 
 
 def may_round(kind: str) -> bool:
     """Whether a format has a type that `rounds`."""
-    types = [choice for option in formats()[kind].options if option.name == "type" for choice in option.choices]
-    return kind == ".atlas.png" or any(choice in (*WHOLE_NUMBERS, *BLOCKS) for choice in types)
+    row = formats()[kind]
+    types = [choice for option in row.options if option.name == "type" for choice in option.choices] or [row.sample_type]
+    return any(choice in (*WHOLE_NUMBERS, *BLOCKS) for choice in types)
+
+
+def _sample_type(output: Output) -> str:
+    return str(output.options.get("type", formats()[output.kind].sample_type))
 
 
 BLOCKS = ("bc1", "bc7")
