@@ -13,7 +13,7 @@ from solidgrain.bake.flags import add_cut
 from solidgrain.bake.messages import tell, tell_next, warn
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.space import DEFAULT_SPACE
-from solidgrain.train.command import INTERRUPTED, choose_device, warn_if_uneven
+from solidgrain.train.command import INTERRUPTED, choose_device
 from solidgrain.train.console import Progress, StopRequest
 
 if TYPE_CHECKING:
@@ -125,6 +125,7 @@ def open_features(space: Space, arguments: argparse.Namespace, device: torch.dev
 def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData, FloatArray]:
     """What E and Q make of the photograph, and the pixels to adapt to: all of it, or with --crop what E sees."""
     from solidgrain.bake.sources import Cut, cut_patch
+    from solidgrain.train.begin import warn_if_uneven
     from solidgrain.train.photograph import read_photograph, scaled
 
     photograph = read_photograph(arguments.photo, 1)

@@ -27,7 +27,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from solidgrain.runtime.files import replacing
-from solidgrain.train.command import with_grain
+from solidgrain.train.begin import with_grain
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
 from solidgrain.train.quality import Measure, Measures, Statistics

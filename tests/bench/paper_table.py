@@ -21,7 +21,7 @@ import torch
 
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.files import replacing
-from solidgrain.train.command import with_grain
+from solidgrain.train.begin import with_grain
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
 from solidgrain.train.photograph import read_exemplar

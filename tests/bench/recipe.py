@@ -24,7 +24,7 @@ from solidgrain.bake.arguments import parse_minutes, parse_positive
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.files import replacing
 from solidgrain.train import exemplar as exemplar_module
-from solidgrain.train.command import with_grain
+from solidgrain.train.begin import with_grain
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import evaluate
