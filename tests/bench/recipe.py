@@ -5,7 +5,8 @@ python -m tests.bench.recipe --marks 2,4,6 --out FOLDER [--only ROW] [--exemplar
 Each row is the preset with one setting, or one group of them, as the paper has it. Every row is trained on the same exemplars
 with the same seeds, and measured after so many minutes of training, or with `--by iterations` at the same iterations on any
 machine: VGG-Fréchet and Gram distance of oblique slices over the exemplar's floor, the geometric mean over exemplars and seeds,
-and the worst. For each mark there follow the preset's figures of every exemplar by every measure; table.json has everything.
+and the worst. What another seed does to these means is said below, for it is what a row must surpass. For each mark there
+follow the preset's figures of every exemplar by every measure; table.json has everything.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -165,9 +167,13 @@ def write_results(out: Path, marks: Sequence[float], by: str) -> None:
     """table.md and table.json of what is finished."""
     found = {row: measured for row in ROWS if (measured := collected(out / row))}
     cells.keep(out / "table.json", found)
-    tables = [rows_table(found, marks, by), *(exemplars_table(found.get("fast", {}), mark, by) for mark in marks)]
+    tables = [
+        rows_table(found, marks, by),
+        chance(found, marks),
+        *(exemplars_table(found.get("fast", {}), mark, by) for mark in marks),
+    ]
     with replacing(out / "table.md") as file:
-        file.write("\n\n".join(tables).encode() + b"\n")
+        file.write("\n\n".join(filter(None, tables)).encode() + b"\n")
 
 
 def collected(folder: Path) -> dict[str, dict[str, Any]]:
@@ -186,6 +192,21 @@ def rows_table(found: Found, marks: Sequence[float], by: str) -> str:
         seconds = f"{60 * minutes / iterations:.2f}" if iterations else "–"
         lines.append(f"| {ROWS[row][0]} | {' | '.join(figures)} | {iterations:.0f} | {seconds} |")
     return "\n".join(lines)
+
+
+def chance(found: Found, marks: Sequence[float]) -> str:
+    """How far apart one row's means are for two seeds, in the middle and at most over rows, measures and marks; or ""."""
+    apart = []
+    for measured in found.values():
+        seeds = sorted({cell["settings"]["seed"] for cell in measured.values()})
+        for name, mark in product(SHOWN, marks):
+            of_seeds = [np.log(values(measured, "oblique", name, mark, seed)) for seed in seeds]
+            means = [np.mean(logs) for logs in of_seeds if len(logs) == max(map(len, of_seeds)) > 0]
+            apart += [abs(one - other) for one, other in combinations(means, 2)]
+    if not apart:
+        return ""
+    middle, most = np.expm1([np.median(apart), max(apart)])
+    return f"From one seed to another, a row's mean changes by {middle:.0%} (median; {most:.0%} at most)."
 
 
 def exemplars_table(measured: Mapping[str, Mapping[str, Any]], mark: float, by: str) -> str:
@@ -222,9 +243,12 @@ def titles(first: str, others: Sequence[str]) -> list[str]:
     return [f"| {first} | {' | '.join(others)} |", "|---" * (len(others) + 1) + "|"]
 
 
-def values(measured: Mapping[str, Mapping[str, Any]], kind: str, name: str, mark: float) -> list[float]:
-    """A measure at a mark, of all exemplars and seeds that have it."""
-    return [cell["quality"][kind][name][0] for cell in measured.values() if cell["mark"] == mark and "quality" in cell]
+def values(
+    measured: Mapping[str, Mapping[str, Any]], kind: str, name: str, mark: float, seed: int | None = None
+) -> list[float]:
+    """A measure at a mark, of all exemplars that have it, and of all seeds or one."""
+    finished = (cell for cell in measured.values() if cell["mark"] == mark and "quality" in cell)
+    return [cell["quality"][kind][name][0] for cell in finished if seed in (None, cell["settings"]["seed"])]
 
 
 def over_all(found: Sequence[float]) -> str:

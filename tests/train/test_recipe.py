@@ -79,6 +79,17 @@ def test_the_preset_s_table_ends_with_median_and_worst():
     assert worst == "| worst |  | 4.00 / 8.00 |  |"
 
 
+def test_what_another_seed_changes_is_said_of_those_that_have_all_photographs():
+    def cell(seed, mark, figure):
+        figures = dict.fromkeys(recipe.SHOWN, (figure, 0.0))
+        return {"mark": mark, "quality": {"oblique": figures}, "settings": {"seed": seed}}
+
+    first, second = ({f"{name}-{seed}": cell(seed, 1, figure) for name in "ab"} for seed, figure in ((0, 1.0), (1, 1.1)))
+    third = {"a-2": cell(2, 1, 5.0)}
+    assert recipe.chance({"fast": first | second | third}, [1, 2]).endswith("changes by 10% (median; 10% at most).")
+    assert not recipe.chance({"fast": first}, [1])
+
+
 def test_marks_may_be_iterations(small, tmp_path, capsys):
     flags = ["2,3" if flag == "0.01,0.02" else flag for flag in small]
     recipe.main([*flags, "--by", "iterations", "--only", "fast"])
