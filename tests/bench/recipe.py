@@ -65,7 +65,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "noise-weight": ("the same, A from N(0,1)", from_noise("noise_weight_start")),
     "contrast": ("D sees colours as they are", as_paper("critic_contrast")),
     "colors": ("S speaks red, green, blue", as_paper("principal_colors")),
-    "random-rgb": ("both of these", as_paper("critic_start", "principal_colors")),
+    "random-rgb": ("the same, D from N(0,1)", as_paper("critic_start", "principal_colors")),
     "lazy": ("penalty every iteration", as_paper("penalty_every")),
     "gram": ("Gram differences as they are", as_paper("relative_gram")),
     "octave-rate": ("T_i as fast as the rest", as_paper("octave_rate")),
