@@ -24,13 +24,11 @@ from solidgrain.train.run import (
     Source,
     create_run,
     held,
-    is_space,
-    open_run,
     pixels_sha256,
     undone_on_failure,
 )
 from solidgrain.train.settings import PRESET_ITERATIONS, Budget, Settings, preset
-from solidgrain.train.space_run import SpaceRun, create_space_run, open_space_run
+from solidgrain.train.space_run import SpaceRun, create_space_run, open_any
 from solidgrain.train.variants import vary
 from solidgrain.train.vgg import find_weights
 from solidgrain.train.warm_start import learned, warm_start
@@ -132,11 +130,6 @@ def start_space(arguments: argparse.Namespace) -> RunFolder:
     source = Source("", arguments.license or "", arguments.credit or "")
     budget = make_budget(arguments, settings)
     return create_space_run(arguments.out, settings, members, held_out_names(arguments.hold_out), source, budget)
-
-
-def open_any(folder: Path) -> RunFolder:
-    """A run directory of either kind."""
-    return open_space_run(folder) if is_space(folder) else open_run(folder)
 
 
 def make_settings(arguments: argparse.Namespace) -> Settings:

@@ -23,6 +23,8 @@ from solidgrain.train.run import (
     Source,
     common_options,
     creating,
+    is_space,
+    open_run,
     opening,
     pixels_sha256,
     source_revision,
@@ -92,6 +94,11 @@ def open_space_run(folder: Path) -> SpaceRun:
         held_out = frozenset(entry["exemplar"] for entry in entries if entry["held_out"])
         common = common_options(folder, options)
         return SpaceRun(*common, members, held_out, str(options["license"]), str(options["credit"]))
+
+
+def open_any(folder: Path) -> RunFolder:
+    """A run directory of either kind. Raises TrainingError if it is not one, or was tampered with."""
+    return open_space_run(folder) if is_space(folder) else open_run(folder)
 
 
 def allow_open_files(count: int) -> None:

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.train.loop import Trainer
-from solidgrain.train.run import CHECKPOINT, RunFolder, is_space, open_run, read_checkpoint
+from solidgrain.train.run import CHECKPOINT, RunFolder, read_checkpoint
 from solidgrain.train.sampler import COLORS
-from solidgrain.train.space_run import open_space_run
+from solidgrain.train.space_run import open_any
 
 
 def learned(other: Path) -> dict[str, Any]:
@@ -24,7 +24,7 @@ def learned(other: Path) -> dict[str, Any]:
             raise TrainingError(
                 f"--warm-start {other}: no checkpoint, or a damaged one; expected a run, or its {CHECKPOINT}"
             ) from error
-    found = (open_space_run(other) if is_space(other) else open_run(other)).load_checkpoint()
+    found = open_any(other).load_checkpoint()
     if found is None:
         raise TrainingError(f"--warm-start {other}: no checkpoint yet; expected a run that has been trained")
     return found

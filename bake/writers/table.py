@@ -201,14 +201,14 @@ def bounds(output: Output) -> tuple[float, float]:
 
 def rounds(output: Output) -> bool:
     """Whether its colours become whole numbers, blocks of them included: what dither is for."""
-    return _sample_type(output) in (*WHOLE_NUMBERS, *BLOCKS)
+    return _sample_type(output) in ROUNDED
 
 
 def may_round(kind: str) -> bool:
     """Whether a format has a type that `rounds`."""
     row = formats()[kind]
     types = [choice for option in row.options if option.name == "type" for choice in option.choices] or [row.sample_type]
-    return any(choice in (*WHOLE_NUMBERS, *BLOCKS) for choice in types)
+    return any(choice in ROUNDED for choice in types)
 
 
 def _sample_type(output: Output) -> str:
@@ -217,4 +217,5 @@ def _sample_type(output: Output) -> str:
 
 BLOCKS = ("bc1", "bc7")
 WHOLE_NUMBERS = ("uint8", "uint16", "rgba8")
+ROUNDED = (*WHOLE_NUMBERS, *BLOCKS)
 HALVES = ("half", "rgba16f")
