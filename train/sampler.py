@@ -86,8 +86,8 @@ class Sampler(Octaves):
         self.constant = nn.Parameter(torch.ones(m, device=generator.device))
         self.hidden = nn.ModuleList(Linear(m, m, generator) for _ in range(HIDDEN_LAYERS))
         shape = (BINS, n // BINS, m)
-        noise_weights = torch.randn(shape, generator=generator, device=generator.device)
-        self.noise_weights = nn.Parameter(settings.noise_weight_start * noise_weights)  # A of Eq. 2, transposed
+        # A of Eq. 2, transposed
+        self.noise_weights = nn.Parameter(torch.randn(shape, generator=generator, device=generator.device))
         self.output = Linear(m, 3, generator, gain=1.0)
 
     def forward(self, noise: Noise, points: Tensor, condition: Condition | None = None) -> Tensor:

@@ -27,7 +27,6 @@ class Settings:
     resolution: int = 64  # texels along each axis of a noise table
     octave_span: float = 7.0  # octave i scales by 2 ** (span * i / (n - 1))
     orthogonal_start: bool = True  # T_i starts as a random orthogonal matrix, else N(0,1)^{3x3}
-    noise_weight_start: float = 0.5  # standard deviation of A at the start
     principal_colors: bool = False  # the output is along the principal axes of the exemplar's colours, else red, green, blue
     shared_noise: bool = False  # one set of noise tables, read elsewhere in each iteration, else fresh ones
     noise_at_input: bool = False  # all octaves enter S at its input (Fig. 2 a), none its hidden layers
@@ -134,7 +133,6 @@ PAPER = Settings(
     preset="paper",
     octave_span=15.0,
     orthogonal_start=False,
-    noise_weight_start=1.0,
     patch=128,
     batch=16,
     transposed=False,
@@ -173,7 +171,7 @@ PRESETS = {
     ),
     "paper space": replace(PAPER, **SPACE, octave_span=15.5),  # 2^(i/2)
 }
-RETIRED = {"keep_best", "pooled_gram", "group"}  # settings of earlier versions
+RETIRED = {"keep_best", "pooled_gram", "group", "noise_weight_start"}  # settings of earlier versions
 PRESET_ITERATIONS = {"fast": 1200, "paper": 100_000, "fast space": 30_000, "paper space": 300_000}
 
 

@@ -62,7 +62,6 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "octaves": ("the same, with 16 octaves", from_noise("octaves")),
     "octave-span": ("the same, octaves 2^i", from_noise("octave_span")),
     "orthogonal": ("the same, T_i from N(0,1)", from_noise("orthogonal_start")),
-    "noise-weight": ("the same, A from N(0,1)", from_noise("noise_weight_start")),
     "contrast": ("D sees colours as they are", as_paper("critic_contrast")),
     "colors": ("S speaks red, green, blue", as_paper("principal_colors")),
     "random-rgb": ("the same, D from N(0,1)", as_paper("critic_start", "principal_colors")),

@@ -83,7 +83,7 @@ def test_options_that_predate_variants_are_the_method():
 
 
 def test_settings_that_are_gone_are_dropped_where_they_changed_nothing_and_refused_where_they_did():
-    retired = {"keep_best": True, "group": 1, "pooled_gram": False}
+    retired = {"keep_best": True, "group": 1, "pooled_gram": False, "noise_weight_start": 0.5}
     assert from_json(to_json(FAST) | retired) == FAST
     space = preset("fast space")
     assert from_json(to_json(space) | retired | {"pooled_gram": True}) == space
