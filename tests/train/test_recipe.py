@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 
@@ -60,6 +61,8 @@ def test_the_table_has_every_row_at_every_mark_and_a_second_start_changes_nothin
         assert line[3:6] == [" 1.00 / 1.00 ", " 1.00 / 1.00 ", " 1.50 "]
     found = json.loads((tmp_path / "out" / "table.json").read_text())
     assert {row: len(marks) for row, marks in found.items()} == {"fast": 2, "colors": 2}
+    curves = oiio.ImageBuf(f"{tmp_path}/out/curves.png").spec()
+    assert (curves.width, curves.height) == (1200, 600)
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*-0-*.json")}
     recipe.main([*small, "--resume"])
     assert before == {path: path.stat().st_mtime_ns for path in before}
@@ -88,6 +91,22 @@ def test_what_another_seed_changes_is_said_of_those_that_have_all_photographs():
     third = {"a-2": cell(2, 1, 5.0)}
     assert recipe.chance({"fast": first | second | third}, [1, 2]).endswith("changes by 10% (median; 10% at most).")
     assert not recipe.chance({"fast": first}, [1])
+
+
+def test_curves_are_of_rows_or_of_the_exemplars_of_one_row():
+    def cell(exemplar, seed, mark, figure):
+        figures = dict.fromkeys(recipe.SHOWN, (figure, 0.0))
+        return {"exemplar": f"{exemplar}-{seed}", "mark": mark, "quality": {"oblique": figures}, "settings": {"seed": seed}}
+
+    made = [("a", 0, 1, 2.0), ("b", 0, 1, 8.0), ("a", 1, 1, 3.0), ("b", 1, 1, 3.0), ("a", 0, 2, 1.0), ("b", 0, 2, 1.0)]
+    preset_alone = {"fast": {f"{exemplar}-{seed}-{mark}": cell(exemplar, seed, mark, f) for exemplar, seed, mark, f in made}}
+    of_exemplars = recipe.over_time(preset_alone, "gram", [1, 2, 4])
+    assert of_exemplars == {"a": {1: pytest.approx([2, 3]), 2: [1]}, "b": {1: pytest.approx([8, 3]), 2: [1]}}
+    of_rows = recipe.over_time(preset_alone | {"critic": {"a-0-1": cell("a", 0, 1, 5.0)}}, "gram", [1, 2, 4])
+    assert of_rows == {
+        "the preset": {1: pytest.approx([4, 3]), 2: [1]},
+        "D starts from N(0,1)": {1: pytest.approx([5])},
+    }
 
 
 def test_marks_may_be_iterations(small, tmp_path, capsys):
