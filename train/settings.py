@@ -125,7 +125,6 @@ FAST = Settings(
     gram_energy=True,
     color_weight=1.0,
     sampler_rate=4e-3,
-    octave_rate=0.1,
 )
 """Tuned for few CPU minutes. How it departs from the paper, and why, is in docs/training.md."""
 
@@ -166,6 +165,7 @@ PRESETS = {
         gram_energy=False,
         sampler_rate=1e-3,
         sampler_half_life=6000.0,
+        octave_rate=0.1,
         critic_rate=2e-3,
         critic_half_life=6000.0,
     ),

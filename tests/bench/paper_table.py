@@ -49,8 +49,8 @@ TITLES = {
 PRESET = "paper-preset"  # the seventh column
 # What the paper weighs against each other is its own, and no method has a head start: the embedded space is the method's.
 SHARED = ("alpha", "alpha_half_life", "gram_energy", "color_weight", "sampler_start", "octaves", "later_patch")
-FROM_NOISE = 2e-3  # S's rate at the start: the preset's is for a sampler that begins as a stone
-LOSSES = replace(FAST, sampler_rate=FROM_NOISE, **{name: getattr(PAPER, name) for name in SHARED})
+FROM_NOISE = {"sampler_rate": 2e-3, "octave_rate": 0.1}  # the preset's are for a sampler that begins as a stone
+LOSSES = replace(FAST, **FROM_NOISE, **{name: getattr(PAPER, name) for name in SHARED})
 COLUMNS: dict[str, Settings] = {**{name: vary(LOSSES, name) for name in TITLES}, PRESET: PAPER}
 SIFID: dict[str, dict[str, tuple[float, float]]] = {  # x 10^5, Portenier et al. 2020, Table 1
     "wood": {

@@ -68,7 +68,6 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "random-rgb": ("the same, D from N(0,1)", as_paper("critic_start", "principal_colors")),
     "lazy": ("penalty every iteration", as_paper("penalty_every")),
     "gram": ("Gram differences as they are", as_paper("relative_gram")),
-    "octave-rate": ("T_i as fast as the rest", as_paper("octave_rate")),
     "fresh-noise": ("fresh noise tables", as_paper("shared_noise")),
     "critic-rate": ("D learns twice as fast", as_paper("critic_rate", "critic_rate_floor")),
     "sampler-rate": (

@@ -95,7 +95,7 @@ def test_a_space_s_checkpoint_is_small_and_comes_back_to_the_last_bit(tmp_path):
 
 def test_the_checkpoint_of_an_earlier_version_is_taken_up(tmp_path, photograph):
     """They were torch's own files, not packed, and knew one learning rate for all of the sampler."""
-    run = new_run(tmp_path / "run", photograph, octave_rate=1.0)
+    run = new_run(tmp_path / "run", photograph)
     stepped(run).save()
     state = run.load_checkpoint()
     (group,) = state["sampler_optimiser"]["param_groups"]

@@ -288,7 +288,7 @@ def test_a_run_leaves_samples_with_the_exemplar_an_axis_slice_and_an_oblique_one
 def test_training_learns_the_colours_of_the_exemplar(tmp_path, photograph):
     shares = np.linspace(0, 1, 33)
     wanted = np.quantile(read_exemplar(photograph, 64), shares, axis=(0, 1))
-    run, errors = new_run(tmp_path / "run", photograph, average_decay=0.9, principal_colors=False, octave_rate=1), []
+    run, errors = new_run(tmp_path / "run", photograph, average_decay=0.9, principal_colors=False), []
     for iterations in (1, 80):
         train(run, Budget(iterations=iterations), CPU)
         texture = load(export_run(run.folder, tmp_path / f"after-{iterations}"))
