@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from solidgrain.runtime.files import replacing
 
@@ -20,9 +22,6 @@ def draw(path: Path, panels: Mapping[str, Curves], by: str) -> None:
 
     Both axes are logarithmic; a line at 1 is the floor.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure((6 * len(panels), 6), layout="constrained")
     canvas, axes = FigureCanvasAgg(figure), figure.subplots(1, len(panels), squeeze=False)[0]
     for panel, (measure, curves) in zip(axes, panels.items(), strict=True):
