@@ -85,9 +85,8 @@ class Sampler(Octaves):
         n, m = settings.octaves, settings.width
         self.constant = nn.Parameter(torch.ones(m, device=generator.device))
         self.hidden = nn.ModuleList(Linear(m, m, generator) for _ in range(HIDDEN_LAYERS))
-        shape = (BINS, n // BINS, m)
         # A of Eq. 2, transposed
-        self.noise_weights = nn.Parameter(torch.randn(shape, generator=generator, device=generator.device))
+        self.noise_weights = nn.Parameter(torch.randn(BINS, n // BINS, m, generator=generator, device=generator.device))
         self.output = Linear(m, 3, generator, gain=1.0)
 
     def forward(self, noise: Noise, points: Tensor, condition: Condition | None = None) -> Tensor:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from solidgrain.runtime.files import replacing
@@ -23,24 +21,26 @@ def draw(path: Path, panels: Mapping[str, Curves], by: str) -> None:
     Both axes are logarithmic; a line at 1 is the floor.
     """
     figure = Figure((6 * len(panels), 6), layout="constrained")
-    canvas, axes = FigureCanvasAgg(figure), figure.subplots(1, len(panels), squeeze=False)[0]
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for panel, (measure, curves) in zip(axes, panels.items(), strict=True):
         for index, (title, of_mark) in enumerate(curves.items()):
             marks = sorted(of_mark)
-            means = [np.exp(np.mean(np.log(of_mark[mark]))) for mark in marks]
+            means = [geometric_mean(of_mark[mark]) for mark in marks]
             color, dash = f"C{index % MOST_COLORS}", DASHES[index // MOST_COLORS % len(DASHES)]
             panel.plot(marks, means, dash, color=color, marker=".", label=title)
             bounds = ([bound(of_mark[mark]) for mark in marks] for bound in (min, max))
             panel.fill_between(marks, *bounds, color=color, alpha=0.15, linewidth=0)
         panel.axhline(1, color="grey", linewidth=0.8)
         panel.set(xscale="log", yscale="log", xlabel=by, title=f"{measure}, oblique slices / floor")
-        for axis in panel.xaxis, panel.yaxis:
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter("{x:g}" if axis is panel.yaxis else "")
-        ticks = sorted({mark for of_mark in curves.values() for mark in of_mark})
-        panel.set_xticks(ticks, minor=False)
+        panel.set_xticks(sorted({mark for of_mark in curves.values() for mark in of_mark}))
+        panel.xaxis.set_major_formatter("{x:g}")
+        panel.xaxis.set_minor_formatter("")
+        panel.yaxis.set_major_formatter("{x:g}")
+        panel.yaxis.set_minor_formatter("{x:g}")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize="small")
-    picture = io.BytesIO()
-    canvas.print_png(picture)
     with replacing(path) as file:
-        file.write(picture.getbuffer())
+        figure.savefig(file, format="png")
+
+
+def geometric_mean(ratios: Sequence[float]) -> float:
+    return float(np.exp(np.mean(np.log(ratios))))

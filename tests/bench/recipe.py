@@ -6,8 +6,8 @@ Each row is the preset with one setting, or one group of them, as the paper has 
 with the same seeds, and measured after so many minutes of training, or with `--by iterations` at the same iterations on any
 machine: VGG-Fréchet and Gram distance of oblique slices over the exemplar's floor, the geometric mean over exemplars and seeds,
 and the worst. What another seed does to these means is said below, for it is what a row must surpass. For each mark there
-follow the preset's figures of every exemplar by every measure; table.json has everything, curves.png the means over time, of
-rows, or of exemplars where one row alone is run.
+follow the preset's figures of every exemplar by every measure; table.json has everything, and in the end curves.png
+the means over time, of rows, or of exemplars where one row alone is run.
 """
 
 from __future__ import annotations
@@ -102,6 +102,10 @@ def main(argv: Sequence[str] | None = None) -> None:
                 for mark in arguments.marks:
                     finish_mark(folder, settings, exemplar, mark, arguments.by, arguments.slices, device)
                     write_results(arguments.out, arguments.marks, arguments.by)
+    if len(arguments.marks) > 1:
+        found = found_in(arguments.out)
+        panels = {name: over_time(found, name, arguments.marks) for name in SHOWN}
+        curves.draw(arguments.out / "curves.png", panels, arguments.by)
     print((arguments.out / "table.md").read_text("utf-8"))
 
 
@@ -163,8 +167,8 @@ def finish_mark(
 
 
 def write_results(out: Path, marks: Sequence[float], by: str) -> None:
-    """table.md, table.json and curves.png of what is finished."""
-    found = {row: measured for row in ROWS if (measured := collected(out / row))}
+    """table.md and table.json of what is finished."""
+    found = found_in(out)
     cells.keep(out / "table.json", found)
     tables = [
         rows_table(found, marks, by),
@@ -173,24 +177,24 @@ def write_results(out: Path, marks: Sequence[float], by: str) -> None:
     ]
     with replacing(out / "table.md") as file:
         file.write("\n\n".join(filter(None, tables)).encode() + b"\n")
-    if len(marks) > 1:
-        curves.draw(out / "curves.png", {name: over_time(found, name, marks) for name in SHOWN}, by)
 
 
 def over_time(found: Found, name: str, marks: Sequence[float]) -> curves.Curves:
-    """A measure's geometric mean for each seed at each mark: of rows, or of the exemplars where there is one row alone."""
+    """A measure's means for each seed at each finished mark: of rows, or of the exemplars where there is one row alone."""
     lines: dict[str, dict[str, Mapping[str, Any]]] = {}
     for row, measured in found.items():
         for key, cell in measured.items():
             title = ROWS[row][0] if len(found) > 1 else cell["exemplar"].rpartition("-")[0]
             lines.setdefault(title, {})[key] = cell
-    return {title: seeds_by_mark(measured, name, marks) for title, measured in lines.items()}
+    return {
+        title: {mark: means for mark in marks if (means := seed_means(measured, name, mark))}
+        for title, measured in lines.items()
+    }
 
 
-def seeds_by_mark(measured: Mapping[str, Mapping[str, Any]], name: str, marks: Sequence[float]) -> dict[float, list[float]]:
-    """A measure's geometric mean over exemplars, oblique, for each seed that has them all, at the finished marks."""
-    of_mark = {mark: means for mark in marks if (means := seed_means(measured, name, mark))}
-    return {mark: [float(np.exp(mean)) for mean in means] for mark, means in of_mark.items()}
+def found_in(out: Path) -> Found:
+    """What is finished of each row."""
+    return {row: measured for row in ROWS if (measured := collected(out / row))}
 
 
 def collected(folder: Path) -> dict[str, dict[str, Any]]:
@@ -215,7 +219,7 @@ def chance(found: Found, marks: Sequence[float]) -> str:
     """How far apart one row's means are for two seeds, in the middle and at most over rows, measures and marks; or ""."""
     apart = []
     for measured, name, mark in product(found.values(), SHOWN, marks):
-        apart += [abs(one - other) for one, other in combinations(seed_means(measured, name, mark), 2)]
+        apart += [abs(np.log(one / other)) for one, other in combinations(seed_means(measured, name, mark), 2)]
     if not apart:
         return ""
     middle, most = np.expm1([np.median(apart), max(apart)])
@@ -223,10 +227,10 @@ def chance(found: Found, marks: Sequence[float]) -> str:
 
 
 def seed_means(measured: Mapping[str, Mapping[str, Any]], name: str, mark: float) -> list[float]:
-    """The mean of a measure's logarithm over exemplars, oblique, for each seed; without seeds that lack some of them."""
+    """The geometric mean of a measure over exemplars, oblique, for each seed; without seeds that lack some of them."""
     seeds = sorted({cell["settings"]["seed"] for cell in measured.values()})
-    of_seeds = [np.log(values(measured, "oblique", name, mark, seed)) for seed in seeds]
-    return [float(np.mean(logs)) for logs in of_seeds if len(logs) == max(map(len, of_seeds)) > 0]
+    of_seeds = [values(measured, "oblique", name, mark, seed) for seed in seeds]
+    return [curves.geometric_mean(found) for found in of_seeds if len(found) == max(map(len, of_seeds)) > 0]
 
 
 def exemplars_table(measured: Mapping[str, Mapping[str, Any]], mark: float, by: str) -> str:
@@ -276,7 +280,7 @@ def over_all(found: Sequence[float]) -> str:
     if not found:
         return "–"
     worst = f" ({max(found):.2f})" if len(found) > 1 else ""
-    return f"{np.exp(np.mean(np.log(found))):.2f}{worst}"
+    return f"{curves.geometric_mean(found):.2f}{worst}"
 
 
 if __name__ == "__main__":
