@@ -120,11 +120,18 @@ def test_resuming_is_exact_in_bfloat16_and_on_two_threads_as_well(tmp_path, phot
 
 
 def test_bfloat16_is_chosen_where_it_is_faster(monkeypatch):
-    """With AMX, not with AVX-512 BF16 alone, which does not multiply faster than float32; and where it was asked for."""
-    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
-    for amx in (True, False):
+    """With AMX, and with AMD's AVX-512 BF16; not with Intel's alone, which does not multiply faster; and where asked for."""
+    for amx, avx512, cpu, faster in (
+        (True, True, "Intel Xeon Processor", True),
+        (False, True, "Intel Xeon Processor", False),
+        (False, True, "AMD EPYC", True),
+        (False, False, "AMD EPYC", False),
+        (False, True, None, False),  # a torch that does not say whose processor it is
+    ):
         monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda amx=amx: amx)
-        assert loop.use_bfloat16(preset("fast"), CPU) is amx
+        monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda avx512=avx512: avx512)
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda cpu=cpu: {"cpu_name": cpu} if cpu else {}, raising=False)
+        assert loop.use_bfloat16(preset("fast"), CPU) is faster
         for precision in ("float32", "bfloat16"):
             assert loop.use_bfloat16(replace(preset("fast"), precision=precision), CPU) is (precision == "bfloat16")
 
