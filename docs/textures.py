@@ -76,7 +76,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--only", action="append", default=[], metavar="NAME", help="measure this texture; may be repeated (all)")
     add("--resume", action="store_true", help="leave out textures that have their figures, of as many slices")
     add("--exemplars", type=Path, default=EXEMPLARS, metavar="FOLDER", help=f"where the photographs are ({EXEMPLARS})")
-    add("--slices", type=parse_positive, default=200, metavar="N", help="axis-aligned and oblique slices (200)")
+    add("--slices", type=parse_positive, default=100, metavar="N", help="axis-aligned and oblique slices (100)")
     add("--threads", type=parse_count, default=0, metavar="N", help="0: every processor that the process may use (0)")
     add("--out", type=Path, default=HERE, metavar="FOLDER", help=f"where {PAGE} and {DATA} are ({HERE})")
     return parser.parse_args(argv)

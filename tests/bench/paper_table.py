@@ -168,11 +168,18 @@ def sifid_means(kind: str) -> dict[str, float]:
     return {name: mean for name, (mean, _) in SIFID[kind].items()}
 
 
+def sifid(cell: Mapping[str, Any]) -> list[float]:
+    """A cell's SIFID as the paper prints it, mean and deviation."""
+    return [1e5 * cell["quality"]["floor"]["sifid"] * ratio for ratio in cell["quality"]["oblique"]["sifid"]]
+
+
 def table(kind: str, finished: Cells, correlations: Mapping[str, float | None]) -> str:
     """One exemplar's table in Markdown, and the orders of the methods under it."""
     titles = [*TITLES.values(), "the paper's preset"]
     lines = [f"| {kind} | {' | '.join(titles)} |", "|---" * (len(titles) + 1) + "|"]
     lines.append(row("SIFID × 10⁵ (the paper, Table 1)", {name: spread(pair) for name, pair in SIFID[kind].items()}))
+    if "sifid" in measures(finished):
+        lines.append(row("SIFID × 10⁵", {column: spread(sifid(cell)) for column, cell in finished.items() if "quality" in cell}))
     for name in measures(finished):
         figures = {column: spread(cell["quality"]["oblique"][name]) for column, cell in finished.items() if "quality" in cell}
         lines.append(row(f"{name} / floor", figures))

@@ -11,7 +11,7 @@ import pytest
 from solidgrain.export import bundle as bundle_module
 from solidgrain.export.bundle import Details, write_bundle
 from solidgrain.runtime import BundleError, EvaluationError, ProviderError, embedded_names, load
-from solidgrain.runtime.bundle import file_sha256, open_bundle
+from solidgrain.runtime.bundle import embedded_folder, file_sha256, open_bundle
 from solidgrain.runtime.files import exchanged
 from solidgrain.runtime.texture_file import TextureData, read_texture, write_texture
 from tests.toy import toy_weights
@@ -31,6 +31,15 @@ def edit_manifest(folder, **changes):
 def test_granite_is_embedded_and_the_default():
     assert "granite" in embedded_names()
     assert load().name == "granite"
+
+
+def test_embedded_textures_are_small():
+    """What the wheel may weigh: 400 KB a texture, 5 MB all of them."""
+    textures = [bundle for name in embedded_names() if not (bundle := open_bundle(embedded_folder(name))).is_space]
+    sizes = [sum(path.stat().st_size for path in bundle.folder.iterdir()) for bundle in textures]
+    assert len(sizes) >= 8
+    assert max(sizes) <= 400_000
+    assert sum(sizes) < 5_000_000
 
 
 def test_an_unknown_name_suggests_close_ones():

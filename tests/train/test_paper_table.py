@@ -117,6 +117,14 @@ def test_rank_correlation_is_one_for_the_paper_s_own_figures_and_minus_one_for_t
     assert paper_table.correlation("granite", {"paper": 1.0, "a0b1": 2.0}) is None
 
 
+def test_sifid_stands_below_the_paper_s_as_the_paper_prints_it():
+    quality = {"floor": {"sifid": 2e-6}, "oblique": {"sifid": [1.5, 0.25]}}
+    cell = {"quality": quality, "iterations": 1, "minutes": 1.0, "diverged": ""}
+    lines = paper_table.table("wood", {"paper": cell}, {"sifid": None}).splitlines()
+    assert lines[3] == "| SIFID × 10⁵ | – | – | – | – | – | 0.30 ± 0.05 | – |"
+    assert lines[4] == "| sifid / floor | – | – | – | – | – | 1.50 ± 0.25 | – |"
+
+
 def test_sittings_end_with_a_checkpoint_every_few_minutes():
     minutes = [sitting.minutes for sitting in cells._sittings(cells.Budget(None, 12), 4.5)]
     assert minutes == [9.5, 12]
