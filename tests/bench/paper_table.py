@@ -179,7 +179,9 @@ def table(kind: str, finished: Cells, correlations: Mapping[str, float | None]) 
     lines = [f"| {kind} | {' | '.join(titles)} |", "|---" * (len(titles) + 1) + "|"]
     lines.append(row("SIFID × 10⁵ (the paper, Table 1)", {name: spread(pair) for name, pair in SIFID[kind].items()}))
     if "sifid" in measures(finished):
-        lines.append(row("SIFID × 10⁵", {column: spread(sifid(cell)) for column, cell in finished.items() if "quality" in cell}))
+        lines.append(
+            row("SIFID × 10⁵", {column: spread(sifid(cell)) for column, cell in finished.items() if "quality" in cell})
+        )
     for name in measures(finished):
         figures = {column: spread(cell["quality"]["oblique"][name]) for column, cell in finished.items() if "quality" in cell}
         lines.append(row(f"{name} / floor", figures))
