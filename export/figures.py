@@ -60,5 +60,5 @@ def about(copying: Copying) -> str:
     return (
         f"Copying: patches are {copying.ratio:.2f} times as far from the exemplar as its halves are from each other, and "
         f"{100 * copying.closer:.1f} % of {copying.patches} come nearer than 99 % of those do "
-        "(near 1 and 1 %: nothing is copied)."
+        "(near 1 and 1 %: nothing is copied; smooth patches come near to anything, too)."
     )
