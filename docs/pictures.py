@@ -53,7 +53,7 @@ def labels(name: str, texture: Texture) -> tuple[str, str, str, str]:
     photograph = Path(exemplar_of(texture.bundle)["exemplar"]).stem
     grain = grain_of(texture.bundle)
     oblique = "oblique slice" if grain == "none" else f"slice turned about {grain}, the grain"
-    return f"{name}: photograph {photograph}", "axis-aligned slice", oblique, "cut out of the solid"
+    return f"{name}: {photograph}", "axis-aligned slice", oblique, "cut out of the solid"
 
 
 def panels(texture: Texture, photograph: FloatArray | None, shape: Distance, scale: int) -> list[Pixels]:
