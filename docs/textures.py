@@ -46,9 +46,9 @@ least and the greatest mean of the measures below. *copying*: the ratio, near or
 share of patches that come closer than 99 % of the photograph's own. [What is measured](training.md#measuring-quality).
 
 Looked at, in slices and in what was cut out: no streaks, no grid, no direction that a photograph does not have. Missing are
-outlines of a pixel's width: the plates of the lava, the flakes of the chipboard, leaves of the moss, veins of the marble, stones
-of the gravel. Some edges of the lava are olive, some specks of asphalt and gravel a shade bluer than in their photographs. Of
-gravel, marble and wood more patches come close than chance gives; the closest of the gravel are plain grey ones."""
+outlines of a pixel's width: the plates of the lava, the flakes of the chipboard, leaves of the moss, veins of the marble,
+stones of the gravel. Some edges of the lava are olive, some specks of asphalt and gravel a shade bluer than in their photographs.
+Of gravel, marble and wood more patches come close than chance gives; the closest of the gravel are plain grey ones."""
 HEADER = ("texture", "photograph", "licence", "credit", "axis-aligned", "oblique", "copying")
 
 
