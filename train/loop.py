@@ -352,7 +352,7 @@ def is_octave(name: str) -> bool:
 def use_bfloat16(settings: Settings, device: torch.device) -> bool:
     """Whether plain forward passes run in bfloat16: unless told so, only where that was measured to be faster.
 
-    AVX-512 BF16 alone, without AMX, trains a third faster than float32 on AMD's Zen 5 and a sixth slower on Intel's Xeons
+    AVX-512 BF16 alone, without AMX, takes two thirds of float32's time on AMD's Zen 5 and a sixth more than it on Intel's Xeons
     (docs/training.md).
     """
     if settings.precision != "auto":
