@@ -359,13 +359,13 @@ def use_bfloat16(settings: Settings, device: torch.device) -> bool:
         return settings.precision == "bfloat16"
     if device.type == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
-    return bool(torch.cpu._is_amx_tile_supported() or (torch.cpu._is_avx512_bf16_supported() and is_amd()))
+    return bool(torch.cpu._is_amx_tile_supported()) or is_amd_with_bfloat16()
 
 
-def is_amd() -> bool:
-    """Whether this processor is AMD's; no where torch is too old to tell."""
+def is_amd_with_bfloat16() -> bool:
+    """Whether this processor is AMD's and has AVX-512 BF16; no where torch is too old to tell."""
     capabilities: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
-    return str(capabilities.get("cpu_name")).startswith("AMD")
+    return str(capabilities.get("cpu_name")).startswith("AMD") and bool(capabilities.get("avx512_bf16"))
 
 
 def _write_sample(trainer: Trainer) -> None:

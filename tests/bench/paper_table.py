@@ -168,9 +168,9 @@ def sifid_means(kind: str) -> dict[str, float]:
     return {name: mean for name, (mean, _) in SIFID[kind].items()}
 
 
-def sifid(cell: Mapping[str, Any]) -> list[float]:
+def sifid(quality: Mapping[str, Any]) -> list[float]:
     """A cell's SIFID as the paper prints it, mean and deviation."""
-    return [1e5 * cell["quality"]["floor"]["sifid"] * ratio for ratio in cell["quality"]["oblique"]["sifid"]]
+    return [1e5 * quality["floor"]["sifid"] * ratio for ratio in quality["oblique"]["sifid"]]
 
 
 def table(kind: str, finished: Cells, correlations: Mapping[str, float | None]) -> str:
@@ -178,12 +178,11 @@ def table(kind: str, finished: Cells, correlations: Mapping[str, float | None]) 
     titles = [*TITLES.values(), "the paper's preset"]
     lines = [f"| {kind} | {' | '.join(titles)} |", "|---" * (len(titles) + 1) + "|"]
     lines.append(row("SIFID × 10⁵ (the paper, Table 1)", {name: spread(pair) for name, pair in SIFID[kind].items()}))
+    measured = {column: cell["quality"] for column, cell in finished.items() if "quality" in cell}
     if "sifid" in measures(finished):
-        lines.append(
-            row("SIFID × 10⁵", {column: spread(sifid(cell)) for column, cell in finished.items() if "quality" in cell})
-        )
+        lines.append(row("SIFID × 10⁵", {column: spread(sifid(quality)) for column, quality in measured.items()}))
     for name in measures(finished):
-        figures = {column: spread(cell["quality"]["oblique"][name]) for column, cell in finished.items() if "quality" in cell}
+        figures = {column: spread(quality["oblique"][name]) for column, quality in measured.items()}
         lines.append(row(f"{name} / floor", figures))
     lines.append(row("iterations", {column: f"{cell['iterations']}" for column, cell in finished.items()}))
     lines.append(row("minutes", {column: f"{cell['minutes']:.0f}" for column, cell in finished.items()}))

@@ -129,8 +129,8 @@ def test_bfloat16_is_chosen_where_it_is_faster(monkeypatch):
         (False, True, None, False),  # a torch that does not say whose processor it is
     ):
         monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda amx=amx: amx)
-        monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda avx512=avx512: avx512)
-        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda cpu=cpu: {"cpu_name": cpu} if cpu else {}, raising=False)
+        capabilities = {"avx512_bf16": avx512} | ({"cpu_name": cpu} if cpu else {})
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda found=capabilities: found, raising=False)
         assert loop.use_bfloat16(preset("fast"), CPU) is faster
         for precision in ("float32", "bfloat16"):
             assert loop.use_bfloat16(replace(preset("fast"), precision=precision), CPU) is (precision == "bfloat16")
