@@ -134,14 +134,14 @@ def section(name: str, bundle: Bundle, found: Found | None) -> str:
     """All that there is to say of a texture."""
     _, photograph, license, credit, *_ = summary(name, bundle, found)
     training, grain = bundle.manifest["training"], grain_of(bundle)
-    size = sum(path.stat().st_size for path in bundle.folder.iterdir())
     turned = "turned freely" if grain == "none" else f"turned about the {grain} axis only"
     uneven = (found or {}).get("nonstationarity", 0)
     change = f"; changes across itself: nonstationarity {uneven:.2f}, above {NONSTATIONARY}" if uneven > NONSTATIONARY else ""
     facts = [
         f"- photograph: {photograph}, licence {license}, credit {credit}{change}",
         f"- training: {training['iterations']:,} iterations, {training['minutes']:g} minutes; slices {turned}",
-        f"- bundle: {size / 1024:.0f} KB; {bundle.manifest['octaves']} octaves, {bundle.manifest['width']} units a layer",
+        f"- bundle: {bundle.size / 1024:.0f} KB; "
+        f"{bundle.manifest['octaves']} octaves, {bundle.manifest['width']} units a layer",
     ]
     return "\n".join([f"## {name}", "", *facts, "", quality(found) if found else "Not measured yet.", ""])
 

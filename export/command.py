@@ -36,10 +36,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.overwrite and companion.is_file() and not arguments.companion:
         warn(f"{companion}: is not written anew without --companion, and solidgrain adapt needs it")
     folder = export_space_run(*common, arguments.companion) if space else export_run(*common)
+    bundle = open_bundle(folder)
     if arguments.json:
-        print(json.dumps(open_bundle(folder).manifest, indent=2))
+        print(json.dumps(bundle.manifest, indent=2))
     else:
-        size = sum(path.stat().st_size for path in folder.iterdir())
         source = f"PHOTO --bundle {shlex.quote(str(folder))}" if space else shlex.quote(str(folder))
-        tell(f"{folder}: {size / 1024:.0f} KB; next: solidgrain bake {source} --size 128 --out out.vti")
+        tell(f"{folder}: {bundle.size / 1024:.0f} KB; next: solidgrain bake {source} --size 128 --out out.vti")
     return 0

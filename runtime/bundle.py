@@ -59,6 +59,11 @@ class Bundle:
         return ENCODER in self.manifest["files"]
 
     @property
+    def size(self) -> int:
+        """Bytes on disk, of all that lies in the folder."""
+        return sum(path.stat().st_size for path in self.folder.iterdir())
+
+    @property
     def sampler_sha256(self) -> str:
         return str(self.manifest["files"][SAMPLER])
 

@@ -125,7 +125,7 @@ def open_features(space: Space, arguments: argparse.Namespace, device: torch.dev
 def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData, FloatArray]:
     """What E and Q make of the photograph, and the pixels to adapt to: all of it, or with --crop what E sees."""
     from solidgrain.bake.sources import Cut, cut_patch
-    from solidgrain.train.begin import warn_if_uneven
+    from solidgrain.train.begin import warn_of
     from solidgrain.train.photograph import read_photograph, scaled
 
     photograph = read_photograph(arguments.photo, 1)
@@ -136,7 +136,7 @@ def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData
     tell(note)
     start = space.own(space.encode(patch, arguments.photo.stem, cut.scale or 1.0))
     material = patch if cut.corner else scaled(photograph.pixels, cut.scale or 1.0)
-    warn_if_uneven(arguments.photo, material)
+    warn_of(arguments.photo, material)
     return start, material
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from solidgrain.bake.messages import tell, warn
 from solidgrain.runtime.bundle import embedded_folder, open_bundle
 from solidgrain.runtime.errors import TrainingError, UsageError
 from solidgrain.train.collection import read_members
-from solidgrain.train.exemplar import NONSTATIONARY, FloatArray, measure_grain, nonstationarity
+from solidgrain.train.exemplar import FRAMED, NONSTATIONARY, FloatArray, edge_step, measure_grain, nonstationarity
 from solidgrain.train.photograph import read_photograph, scaled
 from solidgrain.train.run import (
     CHECKPOINT,
@@ -106,7 +106,7 @@ def start(arguments: argparse.Namespace) -> Run:
     exemplar = scaled(photograph, scale)
     if warning:
         warn(f"{arguments.exemplar}: {warning}")
-    warn_if_uneven(arguments.exemplar, exemplar)
+    warn_of(arguments.exemplar, exemplar)
     settings = with_grain(settings, arguments.anisotropic, exemplar)
     of_photograph = "" if scale == 1 else pixels_sha256(photograph)
     source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace, scale, of_photograph)
@@ -179,28 +179,43 @@ def held_out_names(text: str | None) -> int | list[str]:
         raise UsageError(f"--hold-out {text}: expected a number, or a file with a name per line ({error})") from error
 
 
-def warn_if_uneven(path: Path, exemplar: FloatArray) -> None:
-    """Say that one texture cannot describe a photograph, if that is so."""
+def warn_of(path: Path, exemplar: FloatArray) -> None:
+    """Say what a photograph has that a texture should not have."""
     if (found := nonstationarity(exemplar)) > NONSTATIONARY:
         warn(
             f"{path} changes across itself (nonstationarity {found:.2f}, above {NONSTATIONARY}); "
             "crop an even part of it for better results"
         )
+    if (found := edge_step(exemplar)) > FRAMED:
+        warn(
+            f"{path} seems to have a frame: near an edge, neighbouring pixels differ {found:.1f} times as much as further in "
+            f"(above {FRAMED:g}); crop it off, or it is learned, too"
+        )
 
 
 def misgivings(run: RunFolder, warm_start: Path | None) -> list[str]:
     """What is to be said of a space's photographs; of a single one it has been."""
-    lines = (about_uneven(run), about_seen(run, warm_start)) if isinstance(run, SpaceRun) else ()
+    lines = (about_uneven(run), about_framed(run), about_seen(run, warm_start)) if isinstance(run, SpaceRun) else ()
     return [line for line in lines if line]
 
 
 def about_uneven(run: SpaceRun) -> str:
     """Which photographs one texture cannot describe, or ""."""
-    changes = {member.name: nonstationarity(member.exemplar) for member in run.trained_on}
-    uneven = [f"{name} ({change:.2f})" for name, change in changes.items() if change > NONSTATIONARY]
-    count = f"{len(uneven)} of {len(run.trained_on)} photographs"
     what = f"change across themselves (nonstationarity above {NONSTATIONARY})"
-    return f"{count} {what}: {some(uneven)}; crop even parts of them for better results" if uneven else ""
+    return about_those(run, nonstationarity, NONSTATIONARY, what, "crop even parts of them for better results")
+
+
+def about_framed(run: SpaceRun) -> str:
+    """Which photographs have a frame, or ""."""
+    what = f"seem to have a frame (near an edge, neighbouring pixels differ more than {FRAMED:g} times as much as further in)"
+    return about_those(run, edge_step, FRAMED, what, "crop it off, or it is learned, too")
+
+
+def about_those(run: SpaceRun, measure: Callable[[FloatArray], float], limit: float, what: str, advice: str) -> str:
+    """How many photographs are above a limit, and which; or ""."""
+    found = {member.name: measure(member.exemplar) for member in run.trained_on}
+    above = [f"{name} ({figure:.2f})" for name, figure in found.items() if figure > limit]
+    return f"{len(above)} of {len(run.trained_on)} photographs {what}: {some(above)}; {advice}" if above else ""
 
 
 def about_seen(run: SpaceRun, warm_start: Path | None) -> str:

@@ -31,7 +31,7 @@ from solidgrain.train.slices import from_quaternions, upright
 from solidgrain.train.variants import vary
 from tests.bench import cells
 
-DEFAULTS = {  # the embedded critic, which FAST starts from, has seen neither
+DEFAULTS = {
     "wood": cells.EXEMPLARS / "large" / "materialx_wood.jpg",
     "granite": cells.EXEMPLARS / "stone128" / "Granite002A.png",
 }
@@ -48,10 +48,11 @@ TITLES = {
 }
 PRESET = "paper-preset"  # the seventh column
 # What the paper weighs against each other is its own, and no method has a head start: the embedded space is the method's.
-SHARED = ("alpha", "alpha_half_life", "gram_energy", "color_weight", "sampler_start", "octaves", "later_patch")
-FROM_NOISE = {"sampler_rate": 2e-3, "octave_rate": 0.1}  # the preset's are for a sampler that begins as a stone
-LOSSES = replace(FAST, **FROM_NOISE, **{name: getattr(PAPER, name) for name in SHARED})
-COLUMNS: dict[str, Settings] = {**{name: vary(LOSSES, name) for name in TITLES}, PRESET: PAPER}
+LOSSES_OF_THE_PAPER = ("alpha", "alpha_half_life", "gram_energy", "color_weight")
+NO_HEAD_START = ("critic_start", "sampler_start", "octaves", "later_patch")
+FROM_NOISE = {"sampler_rate": 2e-3}  # the preset's is for a sampler that begins as a stone
+SHARED = replace(FAST, **FROM_NOISE, **{name: getattr(PAPER, name) for name in LOSSES_OF_THE_PAPER + NO_HEAD_START})
+COLUMNS: dict[str, Settings] = {**{name: vary(SHARED, name) for name in TITLES}, PRESET: PAPER}
 SIFID: dict[str, dict[str, tuple[float, float]]] = {  # x 10^5, Portenier et al. 2020, Table 1
     "wood": {
         "henzler": (0.67, 0.42), "gan+vgg": (0.19, 0.04), "noise-at-input": (0.28, 0.04),

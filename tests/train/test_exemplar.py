@@ -12,7 +12,7 @@ import torch
 
 from solidgrain.runtime import ExemplarError
 from solidgrain.train import exemplar
-from solidgrain.train.exemplar import draw_patches, measure_grain, nonstationarity
+from solidgrain.train.exemplar import FRAMED, draw_patches, edge_step, measure_grain, nonstationarity
 from solidgrain.train.photograph import read_exemplar, read_photograph, scaled
 from solidgrain.train.settings import preset
 from tests.train.conftest import blotches
@@ -223,3 +223,12 @@ def test_nonstationarity_tells_a_gradient_from_an_even_texture():
     even = blotches(128, 128)
     gradient = even * 0.3 + np.linspace(0, 0.7, 128, dtype=np.float32)[:, None, None]
     assert nonstationarity(even) < 0.3 < nonstationarity(gradient)
+
+
+@pytest.mark.parametrize("width", [1, 4])
+def test_a_frame_is_a_step_near_an_edge_that_nothing_beside_it_comes_near(width):
+    whole = 0.4 + 0.2 * blotches(128, 160)
+    framed = whole.copy()
+    framed[:, -width:] = 0
+    assert edge_step(whole) < 2 < FRAMED < edge_step(framed)
+    assert edge_step(np.full((64, 64, 3), 0.5, np.float32)) == 0

@@ -105,7 +105,7 @@ def test_a_missing_exemplar_is_refused_before_anything_is_made(small, tmp_path, 
 def test_the_columns_are_the_paper_s_methods_and_its_own_settings():
     assert list(paper_table.COLUMNS) == [*paper_table.SIFID["wood"], "paper-preset"]
     losses = {"alpha": 0.1, "alpha_half_life": 0.0, "gram_energy": False, "color_weight": 0.0}
-    shared = {"sampler_start": "", "sampler_rate": 2e-3, "octave_rate": 0.1, "octaves": 16, "later_patch": 0}
+    shared = {"critic_start": "", "sampler_start": "", "sampler_rate": 2e-3, "octaves": 16, "later_patch": 0}
     assert paper_table.COLUMNS["paper"] == replace(FAST, **losses, **shared)
     assert paper_table.COLUMNS["paper-preset"] == PAPER
 

@@ -20,6 +20,7 @@ from solidgrain.train.run import open_run
 from solidgrain.train.settings import Budget, preset
 from solidgrain.train.space_run import open_space_run
 from solidgrain.train.task import TextureSpace
+from tests.train.conftest import blotches
 from tests.train.spaces import TINY_SPACE, new_space, photographs, picture, write
 from tests.train.test_collection import damage
 from tests.train.test_training import CPU, endless_training, losses, new_run, tensors
@@ -191,6 +192,15 @@ def test_photographs_that_change_across_themselves_are_named(solidgrain, tmp_pat
     assert outcome.code == 0, outcome.err
     (warning,) = [line for line in outcome.err.splitlines() if "of 3 photographs change across themselves" in line]
     assert "(nonstationarity above 0.3): evening sky.png (0.9" in warning
+
+
+def test_photographs_with_a_frame_are_named(solidgrain, tmp_path, small_presets):
+    folder = photographs(tmp_path / "stones", 2)
+    write(folder / "framed.png", np.pad(0.4 + 0.2 * blotches(150, 140), ((1, 1), (1, 1), (0, 0))))
+    outcome = solidgrain("train", "--space", folder, "--out", tmp_path / "run", *SMALL, "--iterations", 1)
+    assert outcome.code == 0, outcome.err
+    (warning,) = [line for line in outcome.err.splitlines() if "of 3 photographs seem to have a frame" in line]
+    assert "3 times as much as further in): framed.png (" in warning
 
 
 def test_held_out_photographs_that_the_warm_start_has_seen_are_named(solidgrain, tmp_path, small_presets):

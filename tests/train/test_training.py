@@ -25,6 +25,7 @@ from solidgrain.runtime.bundle import open_bundle
 from solidgrain.runtime.files import temporary_name
 from solidgrain.train import command, loop
 from solidgrain.train import run as run_module
+from solidgrain.train.exemplar import edge_step
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, held, open_run, pixels_sha256
@@ -534,6 +535,15 @@ def test_a_gradient_gets_a_warning_that_names_the_figure(solidgrain, tmp_path):
         "train", tmp_path / "ramp.png", "--out", tmp_path / "run", "--iterations", 1, "--patch", 32, "--batch", 1
     )
     assert "nonstationarity 0.9" in outcome.err
+
+
+def test_a_frame_gets_a_warning_that_names_the_figure(solidgrain, tmp_path):
+    framed = np.pad(0.4 + 0.2 * blotches(92, 92), ((2, 2), (2, 2), (0, 0)))
+    oiio.ImageBuf(framed).write(os.fspath(tmp_path / "framed.png"), oiio.UINT8)
+    flags = ["--out", tmp_path / "run", "--iterations", 1, "--patch", 32, "--batch", 1]
+    outcome = solidgrain("train", tmp_path / "framed.png", *flags)
+    said = re.search(r"framed.png seems to have a frame: .* differ (.*) times as much as further in \(above 3\)", outcome.err)
+    assert float(said[1]) == pytest.approx(edge_step(framed), abs=0.1)
 
 
 def test_a_training_that_leaves_nothing_fails(tmp_path, photograph, solidgrain, monkeypatch):
