@@ -27,11 +27,11 @@ from solidgrain.runtime.bundle import Bundle
 from solidgrain.runtime.files import replacing
 from solidgrain.runtime.workers import usable_threads
 from solidgrain.train.copying import Copying
-from solidgrain.train.exemplar import NONSTATIONARY, nonstationarity
+from solidgrain.train.exemplar import NONSTATIONARY
 from solidgrain.train.quality import Evaluation
 from solidgrain.train.vgg import find_weights
 
-Found = dict[str, Any]  # what `solidgrain evaluate --json` prints, `files`, and the photograph's `nonstationarity`
+Found = dict[str, Any]  # what `solidgrain evaluate --json` prints, and `files`
 PAGE, DATA = "textures.md", "textures.json"
 INTRODUCTION = """\
 # The embedded textures
@@ -48,7 +48,8 @@ share of patches that come closer than 99 % of the photograph's own. [What is me
 Looked at, in slices and in what was cut out: no streaks, no grid, no direction that a photograph does not have. Missing are
 outlines of a pixel's width: the plates of the lava, the flakes of the chipboard, leaves of the moss, veins of the marble,
 stones of the gravel. Some edges of the lava are olive, some specks of asphalt and gravel a shade bluer than they should be.
-Of gravel, marble and wood more patches come close than chance gives; the closest of the gravel are plain grey ones."""
+Of granite-pink, gravel, marble and wood more patches come close than chance gives; the closest of the gravel are plain grey
+ones."""
 HEADER = ("texture", "photograph", "licence", "credit", "axis-aligned", "oblique", "copying")
 
 
@@ -69,8 +70,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         texture = load_texture(bundles[name].folder, threads=arguments.threads)
         measured = measure(texture, photograph, arguments.slices)
         write_quality(texture, measured.figures)
-        files = {"files": bundles[name].manifest["files"], "nonstationarity": nonstationarity(photograph)}
-        found[name] = files | measured.as_json()
+        found[name] = {"files": bundles[name].manifest["files"]} | measured.as_json()
         write_results(arguments.out, bundles, found)
     write_results(arguments.out, bundles, found)
 

@@ -23,15 +23,16 @@ from solidgrain.runtime.bundle import SAMPLER, Bundle
 from solidgrain.runtime.errors import BundleError, ExemplarError, TrainingError
 from solidgrain.runtime.fold import read_weights
 from solidgrain.runtime.texture_file import TextureData
+from solidgrain.train.average import follow
 from solidgrain.train.collection import LEVELS, Member, draw_patches, wraps
 from solidgrain.train.companion import Companion
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
-from solidgrain.train.loop import use_bfloat16
 from solidgrain.train.losses import gram_difference, mean_gram, mean_grams
 from solidgrain.train.noise import Noise, draw_noise, look_up
+from solidgrain.train.precision import autocast, use_bfloat16
 from solidgrain.train.settings import Budget, Settings
-from solidgrain.train.slices import UNIT, draw_slices
+from solidgrain.train.slices import UNIT, as_images, draw_slices
 from solidgrain.train.streams import MEASURE, stream
 from solidgrain.train.vgg import Vgg
 
@@ -188,7 +189,7 @@ class Adaptation:
         for group in self.optimiser.param_groups:
             group["lr"] = pace * group["start"]
         self.optimiser.step()
-        self._update_average()
+        follow(self.average, self.theta, self.iteration, self.recipe.average_decay)
         self.iteration += 1
         return float(loss.detach())
 
@@ -197,10 +198,11 @@ class Adaptation:
         settings = self.settings
         points = draw_slices(settings, generator)
         eta = look_up(noise.moved(generator), theta.directions * self.octave_scale, points)
-        with self._autocast():  # coordinates stay outside it: in bfloat16 they are wrong by texels
+        with autocast(
+            self.generator.device, self.reduced_precision
+        ):  # coordinates stay outside it: in bfloat16 they are wrong by texels
             rgb = self.sampler(eta, theta)
-            images = rgb.float().reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2)
-            activations = self.features.activations(self.stretch(images))
+            activations = self.features.activations(self.stretch(as_images(rgb.float(), settings.patch)))
         pairs = zip(self.target, activations, strict=True)
         terms = [gram_difference(wanted, mean_gram(of_layer), self.features.relative) for wanted, of_layer in pairs]
         return torch.stack(terms).mean()
@@ -218,7 +220,7 @@ class Adaptation:
 
         def look() -> Sequence[Tensor]:
             crops = draw_patches(member, self.settings.patch, self.settings.batch, self.settings, self.generator)
-            with self._autocast():
+            with autocast(self.generator.device, self.reduced_precision):
                 return self.features.activations(self.stretch(crops))
 
         return mean_grams(look() for _ in range(math.ceil(self.recipe.crops / self.settings.batch)))
@@ -234,15 +236,6 @@ class Adaptation:
         directions, gamma, delta, noise_weights = (part.detach().cpu().numpy() for part in theta)
         transforms = directions.astype(np.float64) * self.sizes
         return replace(self.start, transforms=transforms, gamma=gamma, delta=delta, noise_weights=noise_weights)
-
-    @torch.no_grad()
-    def _update_average(self) -> None:
-        keep = min(self.recipe.average_decay, (1 + self.iteration) / (10 + self.iteration))
-        for average, current in zip(self.average, self.theta, strict=True):
-            average.lerp_(current, 1 - keep)
-
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast(self.generator.device.type, torch.bfloat16, enabled=self.reduced_precision)
 
 
 @dataclass

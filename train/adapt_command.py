@@ -13,7 +13,7 @@ from solidgrain.bake.flags import add_cut
 from solidgrain.bake.messages import tell, tell_next, warn
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.space import DEFAULT_SPACE
-from solidgrain.train.command import INTERRUPTED, choose_device
+from solidgrain.train.command import INTERRUPTED, choose_device, forbid_tf32
 from solidgrain.train.console import Progress, StopRequest
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     check_flags(arguments)
     check_new(arguments.out, arguments.overwrite)
+    forbid_tf32()
     device = choose_device(arguments.device)
     threads = arguments.threads or usable_threads()
     torch.set_num_threads(threads)
@@ -125,7 +126,7 @@ def open_features(space: Space, arguments: argparse.Namespace, device: torch.dev
 def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData, FloatArray]:
     """What E and Q make of the photograph, and the pixels to adapt to: all of it, or with --crop what E sees."""
     from solidgrain.bake.sources import Cut, cut_patch
-    from solidgrain.train.begin import warn_of
+    from solidgrain.train.misgivings import of_photograph
     from solidgrain.train.photograph import read_photograph, scaled
 
     photograph = read_photograph(arguments.photo, 1)
@@ -136,7 +137,8 @@ def read_photo(space: Space, arguments: argparse.Namespace) -> tuple[TextureData
     tell(note)
     start = space.own(space.encode(patch, arguments.photo.stem, cut.scale or 1.0))
     material = patch if cut.corner else scaled(photograph.pixels, cut.scale or 1.0)
-    warn_of(arguments.photo, material)
+    for line in of_photograph(arguments.photo, material):
+        warn(line)
     return start, material
 
 

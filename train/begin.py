@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +11,10 @@ from typing import Literal
 import torch
 
 from solidgrain.bake.messages import tell, warn
-from solidgrain.runtime.bundle import embedded_folder, open_bundle
 from solidgrain.runtime.errors import TrainingError, UsageError
-from solidgrain.train.collection import read_members
-from solidgrain.train.exemplar import FRAMED, NONSTATIONARY, FloatArray, edge_step, measure_grain, nonstationarity
+from solidgrain.train import misgivings
+from solidgrain.train.collection import choose_held_out, photographs_in, read_members
+from solidgrain.train.exemplar import FloatArray, measure_grain
 from solidgrain.train.photograph import read_photograph, scaled
 from solidgrain.train.run import (
     CHECKPOINT,
@@ -33,7 +32,6 @@ from solidgrain.train.variants import vary
 from solidgrain.train.vgg import find_weights
 from solidgrain.train.warm_start import learned, warm_start
 
-MOST_NAMES = 5  # of photographs, in a line
 SMALLEST_PATCH = 32  # pixels
 FIXED = (
     "preset",
@@ -70,8 +68,9 @@ def begin(arguments: argparse.Namespace, device: torch.device, stack: ExitStack 
         if other:
             taken, left = warm_start(training, other, device)
             tell(f"{arguments.warm_start}: took over {taken} of {taken + left} parameter tensors")
-    for line in misgivings(training, arguments.warm_start):
-        warn(line)
+    if isinstance(training, SpaceRun):
+        for line in misgivings.of_space(training, arguments.warm_start):
+            warn(line)
     return training
 
 
@@ -93,7 +92,7 @@ def resume(arguments: argparse.Namespace) -> RunFolder:
 
 
 def start(arguments: argparse.Namespace) -> Run:
-    """A new run directory for the photograph, with a warning if one texture cannot describe it."""
+    """A new run directory for the photograph, with what is to be said of it."""
     if arguments.exemplar is None:
         raise UsageError("no EXEMPLAR given; expected a photograph to learn from, or --space FOLDER")
     if strange := [flag for flag in ("hold_out", "skip_unreadable") if getattr(arguments, flag) is not None]:
@@ -106,7 +105,8 @@ def start(arguments: argparse.Namespace) -> Run:
     exemplar = scaled(photograph, scale)
     if warning:
         warn(f"{arguments.exemplar}: {warning}")
-    warn_of(arguments.exemplar, exemplar)
+    for line in misgivings.of_photograph(arguments.exemplar, exemplar):
+        warn(line)
     settings = with_grain(settings, arguments.anisotropic, exemplar)
     of_photograph = "" if scale == 1 else pixels_sha256(photograph)
     source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace, scale, of_photograph)
@@ -125,11 +125,13 @@ def start_space(arguments: argparse.Namespace) -> RunFolder:
     if arguments.anisotropic:
         settings = replace(settings, grain=arguments.anisotropic)
 
+    held_out = held_out_names(arguments.hold_out)
+    choose_held_out([path.name for path in photographs_in(arguments.space)], held_out, settings.seed)  # before all are read
     smallest = max(settings.patch, settings.encoded_patch)
     members = read_members(arguments.space, smallest, bool(arguments.skip_unreadable), warn)
     source = Source("", arguments.license or "", arguments.credit or "")
     budget = make_budget(arguments, settings)
-    return create_space_run(arguments.out, settings, members, held_out_names(arguments.hold_out), source, budget)
+    return create_space_run(arguments.out, settings, members, held_out, source, budget)
 
 
 def make_settings(arguments: argparse.Namespace) -> Settings:
@@ -177,68 +179,3 @@ def held_out_names(text: str | None) -> int | list[str]:
         return [line.strip() for line in Path(text).read_text("utf-8").splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"--hold-out {text}: expected a number, or a file with a name per line ({error})") from error
-
-
-def warn_of(path: Path, exemplar: FloatArray) -> None:
-    """Say what a photograph has that a texture should not have."""
-    if (found := nonstationarity(exemplar)) > NONSTATIONARY:
-        warn(
-            f"{path} changes across itself (nonstationarity {found:.2f}, above {NONSTATIONARY}); "
-            "crop an even part of it for better results"
-        )
-    if (found := edge_step(exemplar)) > FRAMED:
-        warn(
-            f"{path} seems to have a frame: near an edge, neighbouring pixels differ {found:.1f} times as much as further in "
-            f"(above {FRAMED:g}); crop it off, or it is learned, too"
-        )
-
-
-def misgivings(run: RunFolder, warm_start: Path | None) -> list[str]:
-    """What is to be said of a space's photographs; of a single one it has been."""
-    lines = (about_uneven(run), about_framed(run), about_seen(run, warm_start)) if isinstance(run, SpaceRun) else ()
-    return [line for line in lines if line]
-
-
-def about_uneven(run: SpaceRun) -> str:
-    """Which photographs one texture cannot describe, or ""."""
-    what = f"change across themselves (nonstationarity above {NONSTATIONARY})"
-    return about_those(run, nonstationarity, NONSTATIONARY, what, "crop even parts of them for better results")
-
-
-def about_framed(run: SpaceRun) -> str:
-    """Which photographs have a frame, or ""."""
-    what = f"seem to have a frame (near an edge, neighbouring pixels differ more than {FRAMED:g} times as much as further in)"
-    return about_those(run, edge_step, FRAMED, what, "crop it off, or it is learned, too")
-
-
-def about_those(run: SpaceRun, measure: Callable[[FloatArray], float], limit: float, what: str, advice: str) -> str:
-    """How many photographs are above a limit, and which; or ""."""
-    found = {member.name: measure(member.exemplar) for member in run.trained_on}
-    above = [f"{name} ({figure:.2f})" for name, figure in found.items() if figure > limit]
-    return f"{len(above)} of {len(run.trained_on)} photographs {what}: {some(above)}; {advice}" if above else ""
-
-
-def about_seen(run: SpaceRun, warm_start: Path | None) -> str:
-    """Which held-out photographs the weights that this run begins with were trained on, as far as is known, or ""."""
-    seen: set[str] = set()
-    start = run.settings.critic_start if not warm_start else ""
-    if warm_start and warm_start.is_dir():
-        other = open_any(warm_start)
-        start = other.settings.critic_start  # what that run began with has come along
-        if isinstance(other, SpaceRun):
-            seen = {pixels_sha256(member.pixels) for member in other.trained_on}
-    elif warm_start and run.held_out:
-        return f"--warm-start {warm_start}: what it was trained on is not known; held-out photographs may be among it"
-    if start:
-        manifest = open_bundle(embedded_folder(start)).manifest
-        seen |= {entry["sha256"] for entry in manifest["training"].get("exemplars", [])}
-    names = sorted(
-        member.name for member in run.members if member.name in run.held_out and pixels_sha256(member.pixels) in seen
-    )
-    teacher = warm_start or f"the critic of {run.settings.critic_start}"
-    return f"{len(names)} held-out photographs were trained on by {teacher}: {some(names)}; hold out others" if names else ""
-
-
-def some(names: Sequence[str]) -> str:
-    """The first of many names."""
-    return ", ".join(names[:MOST_NAMES]) + ", ..." * (len(names) > MOST_NAMES)

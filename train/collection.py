@@ -57,7 +57,7 @@ def read_members(folder: Path, smallest: int, skip: bool, on_warning: Callable[[
     Files that are unreadable or have fewer than `smallest` pixels along an axis are named to `on_warning` and left out if
     `skip` says so. Raises ExemplarError for the first of them otherwise, and for a folder without photographs.
     """
-    for path in _photographs(folder):
+    for path in photographs_in(folder):
         try:
             photograph = read_photograph(path, smallest, "use a larger photograph")
         except ExemplarError as error:
@@ -71,7 +71,7 @@ def read_members(folder: Path, smallest: int, skip: bool, on_warning: Callable[[
         yield Member(path.name, pixels, wraps(photograph.pixels), photograph.colorspace)
 
 
-def _photographs(folder: Path) -> list[Path]:
+def photographs_in(folder: Path) -> list[Path]:
     """The files of a folder that look like photographs by their names; hidden ones are no one's photographs."""
     if not folder.is_dir():
         raise ExemplarError(f"{folder}: no such folder; expected a folder of photographs (PNG, JPEG, TIFF, EXR, ...)")

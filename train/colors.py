@@ -24,7 +24,7 @@ RESOLUTION = 64  # texels along each axis of a noise table
 def settle_mean(sampler: Sampler | NoiseAtInputSampler, exemplar: FloatArray) -> None:
     """Let the sampler's mean colour be that of an exemplar [H, W, 3], in place."""
     missing = _pixels(exemplar).mean(0) - mean_color(sampler)
-    axes = sampler.color_axes.double().cpu()  # rgb = origin + output axes; all zero if the exemplar has one colour
+    axes = sampler.color_axes.double().cpu()  # rgb = color_mean + output axes; all zero in old runs of one colour
     sampler.output.bias.add_((missing @ torch.linalg.pinv(axes)).to(sampler.output.bias))
 
 

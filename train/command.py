@@ -74,7 +74,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     from solidgrain.runtime.workers import usable_threads
     from solidgrain.train.processes import ElsewhereError, joined, local_device, processes_here
+    from solidgrain.train.run import OPTIONS
 
+    forbid_tf32()
     device = local_device(choose_device(arguments.device))
     torch.set_num_threads(arguments.threads or max(1, usable_threads() // processes_here()))
     with joined(device) as processes:
@@ -82,21 +84,14 @@ def run(arguments: argparse.Namespace) -> int:
             return train_together(arguments, device, processes)
         except ElsewhereError:
             return FAILED
-        except KeyboardInterrupt:
+        except KeyboardInterrupt:  # it was not left the time to save
+            folder: Path = arguments.resume or arguments.out
             if processes.first:
-                tell_of_interruption(arguments)
+                if not (folder / OPTIONS).exists():
+                    raise  # nothing to speak of was begun
+                resume = f"solidgrain train --resume {shlex.quote(str(folder))}{budget_flags(arguments)}"
+                tell(f"interrupted; go on from its last checkpoint with: {resume}")
             return INTERRUPTED
-
-
-def tell_of_interruption(arguments: argparse.Namespace) -> None:
-    """Of a training that was not left the time to save."""
-    from solidgrain.train.run import OPTIONS
-
-    folder: Path = arguments.resume or arguments.out
-    if not (folder / OPTIONS).exists():
-        raise KeyboardInterrupt  # nothing to speak of was begun
-    resume = f"solidgrain train --resume {shlex.quote(str(folder))}{budget_flags(arguments)}"
-    tell(f"interrupted; go on from its last checkpoint with: {resume}")
 
 
 def train_together(arguments: argparse.Namespace, device: torch.device, processes: Processes) -> int:
@@ -116,11 +111,10 @@ def train_on(training: RunFolder, arguments: argparse.Namespace, device: torch.d
     progress = Progress(training.budget, arguments.quiet, describe)
     with processes.errors_once():
         ending = train(training, training.budget, device, progress.show, stop.requested, progress.warn, processes)
-    stopped = processes.any(stop.requested())
     progress.end()
     if processes.first:
-        tell(how_to_go_on(training, stopped, ending, budget_flags(arguments), processes))
-    if stopped:
+        tell(how_to_go_on(training, ending, budget_flags(arguments), processes))
+    if ending.stopped:
         return INTERRUPTED
     return 0 if (training.folder / CHECKPOINT).exists() else FAILED
 
@@ -132,13 +126,13 @@ def describe(report: Report, done: float, left: float) -> str:
     )
 
 
-def how_to_go_on(training: RunFolder, stopped: bool, ending: Ending, flags: str, processes: Processes) -> str:
+def how_to_go_on(training: RunFolder, ending: Ending, flags: str, processes: Processes) -> str:
     from solidgrain.train.run import CHECKPOINT
 
     folder = training.folder
     named = shlex.quote(str(folder))
     done = f"done after {ending.iteration} iterations" if training.budget.until_plateau else "done"
-    if stopped:
+    if ending.stopped:
         together = f" in {processes.count} processes, each" if processes.count > 1 else ""
         return f"stopped{' and saved' * ending.saved}; go on{together} with: solidgrain train --resume {named}{flags}"
     if not (folder / CHECKPOINT).exists():
@@ -157,11 +151,15 @@ def budget_flags(arguments: argparse.Namespace) -> str:
     return given + " --until-plateau" * bool(arguments.until_plateau)
 
 
-def choose_device(name: str) -> torch.device:
-    """Raises TrainingError for CUDA where there is none: no silent fall-back.
+def forbid_tf32() -> None:
+    """Let float32 be float32 on GPUs, too: in TF32, which torch convolves in, gradient penalties keep ten bits of it."""
+    import torch
 
-    Float32 is then float32 on GPUs, too: in TF32, which torch convolves in, gradient penalties keep ten bits of it.
-    """
+    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+
+
+def choose_device(name: str) -> torch.device:
+    """Raises TrainingError for CUDA where there is none: no silent fall-back."""
     import torch
 
     available = torch.cuda.is_available()
@@ -169,5 +167,4 @@ def choose_device(name: str) -> torch.device:
         raise TrainingError(
             f"--device cuda: torch {torch.__version__} sees no CUDA device; use --device cpu or install a CUDA build"
         )
-    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     return torch.device("cuda" if name == "cuda" or (name == "auto" and available) else "cpu")

@@ -39,7 +39,7 @@ class _UnusableError(Exception):
 
 def encode(rgb: FloatArray, spec: oiio.ImageSpec) -> Encoded:
     """Colours [H, W, 3] as a file holds them, in sRGB."""
-    assumed = LINEAR if spec.format.basetype in (oiio.HALF, oiio.FLOAT) else SRGB
+    assumed = LINEAR if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else SRGB
     try:
         return _declared(rgb, spec, assumed)
     except _UnusableError as error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from solidgrain.runtime.bundle import SAMPLER
+from solidgrain.runtime.bundle import SAMPLER, embedded_folder
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.runtime.fold import DoubleArray, read_weights, unstyled
 from solidgrain.runtime.space import Space, load_space
@@ -28,7 +28,7 @@ def begin_as(sampler: Sampler, name: str, exemplar: FloatArray) -> None:
 
     Raises BundleError if there is no such space, TrainingError if its sampler has another size.
     """
-    space = load_space(name)
+    space = load_space(embedded_folder(name))
     texture = space.mapped(mean_code(space, exemplar))
     wanted, found = sampler.noise_weights.shape, texture.noise_weights.shape
     if found != wanted:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,15 +12,18 @@ import torch
 from torch import Tensor, nn
 
 from solidgrain.runtime.errors import TrainingError
+from solidgrain.train.average import follow
 from solidgrain.train.companion import first_critic
 from solidgrain.train.losses import color_loss, gradient_penalty, make_judge, style_loss
 from solidgrain.train.plateau import EVERY, Onlooker, Plateau
+from solidgrain.train.precision import autocast, use_bfloat16
 from solidgrain.train.preview import write_preview
 from solidgrain.train.processes import Processes
-from solidgrain.train.run import CHECKPOINT, PARTS, Run, RunFolder
+from solidgrain.train.run import CHECKPOINT, PARTS, RunFolder
 from solidgrain.train.settings import Budget, Settings, rate
+from solidgrain.train.slices import as_images
 from solidgrain.train.streams import narrowed, stream
-from solidgrain.train.task import Batch, Colors, Inputs, make_task
+from solidgrain.train.task import Colors, Inputs, make_task
 from solidgrain.train.watch import SETTLING, Watch, flaw
 
 ALONE = Processes()
@@ -46,7 +48,7 @@ class Ending(NamedTuple):
 
     iteration: int
     saved: bool  # not if that state is in doubt
-    report: Report | None  # the last, if there was an iteration to do
+    stopped: bool  # before its budget was spent
 
 
 class Trainer:
@@ -70,6 +72,7 @@ class Trainer:
         self.watch = Watch(settles=0 if self.settings.critic_start else SETTLING)
         self.plateau, self.setbacks = Plateau(), 0
         self.onlooker: Onlooker | None = None  # until it is needed
+        processes.share(tensor for part in (self.critic, self.sampler, self.average) for tensor in part.state_dict().values())
         if processes.rank:
             self._draw_anew(processes.rank)  # the same networks everywhere, batches of one's own
 
@@ -81,7 +84,8 @@ class Trainer:
         settings, started = self.settings, time.monotonic()
         self._set_rates()
         batch = self.task.draw(self.iteration, self.generator)
-        fake, real = batch.stretch(self.synthesise(batch)), batch.stretch(batch.real)  # (B, 3, patch, patch)
+        slices = as_images(self.colors_at(batch.inputs), batch.real.shape[-1])
+        fake, real = batch.stretch(slices), batch.stretch(batch.real)  # (B, 3, patch, patch)
 
         critic_loss, penalty = torch.zeros(()), None
         if settings.trains_critic:
@@ -95,7 +99,7 @@ class Trainer:
         self._move(self.sampler, self.sampler_optimiser, sampler_loss)
         self.critic.requires_grad_(True)
 
-        self._update_average()
+        follow(self.average.parameters(), self.sampler.parameters(), self.iteration, settings.average_decay)
         self.iteration += 1
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)  # or the time would be that of launching kernels
@@ -119,13 +123,11 @@ class Trainer:
             color=color_mean if self.settings.color_weight else None,
         )
 
-    def synthesise(self, batch: Batch) -> Tensor:
-        """The batch's slices, as images."""
-        return self._synthesise(batch.inputs).reshape(-1, *batch.real.shape[2:], 3).permute(0, 3, 1, 2)
-
-    def _synthesise(self, inputs: Inputs) -> Tensor:
+    def colors_at(self, inputs: Inputs) -> Tensor:
         """The model's colours [B, P, 3]."""
-        with self._autocast():  # the points are made outside it: in bfloat16 they are off by a tenth of a pixel
+        with autocast(
+            self.device, self.reduced_precision
+        ):  # the points are made outside it: in bfloat16 they are off by a tenth of a pixel
             rgb: Tensor = self.sampler(*inputs)
         return rgb.float()
 
@@ -139,7 +141,7 @@ class Trainer:
     def _critic_loss(self, real: Tensor, fake: Tensor) -> tuple[Tensor, Tensor | None]:
         """L_D of Eq. 3 with the authors' drift term, and its gradient penalty alone when this iteration has one."""
         settings = self.settings
-        with self._autocast():
+        with autocast(self.device, self.reduced_precision):
             logits, _ = self.critic(torch.cat([fake, real]))
         on_fake, on_real = logits.float().chunk(2)
         loss = on_fake.mean() - on_real.mean() + settings.drift * (on_real**2).mean()
@@ -151,7 +153,7 @@ class Trainer:
     def _sampler_losses(self, real: Tensor, fake: Tensor) -> tuple[Tensor, Tensor]:
         """L_style and E[D(f)] of Eq. 4."""
         settings = self.settings
-        with self._autocast():
+        with autocast(self.device, self.reduced_precision):
             on_fake, of_fake = self.judge(fake)
             with torch.no_grad():
                 _, of_real = self.judge(real)
@@ -168,7 +170,7 @@ class Trainer:
         octaves = [parameter for name, parameter in self.sampler.named_parameters() if is_octave(name)]
         for parameter in octaves:
             parameter.requires_grad_(False)
-        found = self._synthesise(colors.inputs)[0]
+        found = self.colors_at(colors.inputs)[0]
         for parameter in octaves:
             parameter.requires_grad_(True)
         return color_loss(colors.wanted, found, self.generator)
@@ -181,26 +183,14 @@ class Trainer:
             sampler_rate = rate(s.sampler_rate, s.sampler_rate_floor, s.sampler_half_life, self.iteration)
             group["lr"] = lowered * group.get("share", 1.0) * sampler_rate
 
-    @torch.no_grad()
-    def _update_average(self) -> None:
-        """Exponential moving average of the weights; its memory grows to a ninth of the training so far."""
-        keep = min(self.settings.average_decay, (1 + self.iteration) / (10 + self.iteration))
-        for average, current in zip(self.average.parameters(), self.sampler.parameters(), strict=True):
-            average.lerp_(current, 1 - keep)
-
     def look(self) -> None:
         """Let the onlooker judge the average. It is training time, too."""
         started = time.monotonic()
-        if self.onlooker is None:
-            assert isinstance(self.run, Run)
-            self.onlooker = Onlooker(self.settings, self.run.exemplar, self.device)
+        self.onlooker = self.onlooker or self.task.onlooker()
         found = torch.tensor([self.onlooker.distance(self.average), time.monotonic() - started], dtype=torch.float64)
         distance, taken = self.processes.mean(found.to(self.device)).tolist()
         self.seconds += taken
         self.plateau.see(distance, self.iteration)
-
-    def _autocast(self) -> AbstractContextManager[None]:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.reduced_precision)
 
     def save(self) -> None:
         parts = {name: getattr(self, name).state_dict() for name in PARTS}
@@ -261,9 +251,8 @@ class Trainer:
         again.load()
         if self.setbacks == MOST_SETBACKS:
             path = self.run.folder / CHECKPOINT
-            way = (
-                f"{path} holds iteration {again.iteration}: export it, or" if again.iteration else "there is no checkpoint yet:"
-            )
+            holds = f"{path} holds iteration {again.iteration}: export it, or"
+            way = holds if path.exists() else "there is no checkpoint yet:"
             raise TrainingError(
                 f"{self.run.folder}: the training diverged at iteration {self.iteration} ({trouble}) after {MOST_SETBACKS} "
                 f"fresh starts at lower rates; {way} train again with another --seed"
@@ -288,18 +277,19 @@ def train(
     """Train until the budget is spent, a plateau that it asks for is reached, or `should_stop` says so; from the run's last
     checkpoint if there is one.
 
-    Leaves a checkpoint and a sample behind in any case. A training that diverges (`watch`) goes back to its last
-    checkpoint, twice at most, and `on_warning` is told; then it raises TrainingError. No checkpoint is ever replaced by a
-    state that is in doubt. Of several `processes`, all call this, and the first alone writes, reports and warns.
+    Leaves a sample behind, and a checkpoint unless its last state is in doubt; a state in doubt never replaces one. A training
+    that diverges (`watch`) goes back to its last checkpoint, twice at most, and `on_warning` is told; then it raises
+    TrainingError. Of several `processes`, all call this, and the first alone writes, reports and warns.
     """
     trainer = Trainer(run, device, processes)
     trainer.load()
     if processes.first:
         run.rewind_stats(trainer.iteration)
-    settings, report = run.settings, None
+    settings, stopped = run.settings, False
 
-    while not budget.done(trainer.iteration, trainer.seconds) and not processes.any(should_stop()):
-        if budget.until_plateau and processes.any(trainer.plateau.reached(trainer.iteration)):
+    while not budget.done(trainer.iteration, trainer.seconds):
+        stopped = processes.any(should_stop())
+        if stopped or (budget.until_plateau and processes.any(trainer.plateau.reached(trainer.iteration))):
             break
         report = trainer.step()
         due = trainer.iteration % settings.checkpoint_every == 0
@@ -330,7 +320,7 @@ def train(
             stays = "; the last checkpoint stays" if (run.folder / CHECKPOINT).exists() else ""
             on_warning(f"iteration {trainer.iteration} is not saved ({doubt}){stays}")
         _write_sample(trainer)
-    return Ending(trainer.iteration, not doubt, report)
+    return Ending(trainer.iteration, not doubt, stopped)
 
 
 def parameter_groups(model: nn.Module, settings: Settings) -> list[dict[str, Any]]:
@@ -347,25 +337,6 @@ def parameter_groups(model: nn.Module, settings: Settings) -> list[dict[str, Any
 def is_octave(name: str) -> bool:
     """Whether a parameter of that name is T_i, or of the network Q that makes them."""
     return "directions" in name or ".octaves." in name
-
-
-def use_bfloat16(settings: Settings, device: torch.device) -> bool:
-    """Whether plain forward passes run in bfloat16: unless told so, only where that was measured to be faster.
-
-    AVX-512 BF16 alone, without AMX, takes two thirds of float32's time on AMD's Zen 5 and a sixth more than it on Intel's Xeons
-    (docs/training.md).
-    """
-    if settings.precision != "auto":
-        return settings.precision == "bfloat16"
-    if device.type == "cuda":
-        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
-    return bool(torch.cpu._is_amx_tile_supported()) or is_amd_with_bfloat16()
-
-
-def is_amd_with_bfloat16() -> bool:
-    """Whether this processor is AMD's and has AVX-512 BF16; no where torch is too old to tell."""
-    capabilities: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
-    return str(capabilities.get("cpu_name")).startswith("AMD") and bool(capabilities.get("avx512_bf16"))
 
 
 def _write_sample(trainer: Trainer) -> None:

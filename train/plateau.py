@@ -23,7 +23,7 @@ from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.losses import gram_difference, mean_grams
 from solidgrain.train.noise import draw_noise
 from solidgrain.train.settings import FAST, Settings
-from solidgrain.train.slices import draw_slices
+from solidgrain.train.slices import as_images, draw_slices
 
 EVERY = 25  # iterations
 BATCHES = 8  # of slices, the same ones each time
@@ -79,8 +79,7 @@ class Onlooker:
         settings, generator, images = self.settings, self._stream(), []
         for _ in range(BATCHES):
             noise = draw_noise(settings.octaves, settings.resolution, generator)
-            rgb = average(noise, draw_slices(settings, generator))
-            images.append(rgb.reshape(-1, settings.patch, settings.patch, 3).permute(0, 3, 1, 2))
+            images.append(as_images(average(noise, draw_slices(settings, generator)), settings.patch))
         pairs = zip(self.wanted, self._mean_grams(images), strict=True)
         return float(torch.stack([gram_difference(wanted, found, relative=True) for wanted, found in pairs]).mean())
 

@@ -46,6 +46,13 @@ class Processes:
         """Whether it is the one that writes files and talks."""
         return self.rank == 0
 
+    def share(self, tensors: Iterable[Tensor]) -> None:
+        """Give all processes the first one's, in place: unlike machines do not draw the same numbers, nor turn axes alike."""
+        if self.count > 1:
+            with self._together():
+                for tensor in tensors:
+                    dist.broadcast(tensor, 0)
+
     def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
         """The mean of all processes' gradients, in place, in one exchange."""
         if self.count == 1:

@@ -75,7 +75,7 @@ def evaluate(
     size = min(image.shape[2] // 2, image.shape[3] // 2, LARGEST_CROP)
     squares = [square.pixels for square in spread_out(distinct(disjoint_crops(image, size)), COMPARED)]
     crops = [measure.statistics(square) for square in squares]
-    floor = _mean(measure.distances(a, b) for i, a in enumerate(crops) for j, b in enumerate(crops) if i != j)
+    floor = floor_between(measure, crops)
     if floor["color"] < SMALLEST_FLOOR:
         raise ExemplarError(
             f"the exemplar has the same colours in each of its squares of {size}² pixels, so that nothing tells how far apart "
@@ -87,8 +87,8 @@ def evaluate(
     def pictures(rotation_of: RotationOf) -> Iterator[Statistics]:
         return (measure.statistics(as_image(one)) for one in take_slices(sample, size, slices, rotation_of))
 
-    axis, _ = _compared(measure, pictures(lambda seed, generator: axis_rotation(seed, grain)), crops, floor)
-    oblique, among = _compared(measure, pictures(lambda seed, generator: oblique_rotation(generator, grain)), crops, floor)
+    axis, _ = compared(measure, pictures(lambda seed, generator: axis_rotation(seed, grain)), crops, floor)
+    oblique, among = compared(measure, pictures(lambda seed, generator: oblique_rotation(generator, grain)), crops, floor)
     return Evaluation(
         crop=size,
         slices=slices,
@@ -196,7 +196,12 @@ class Measure:
         return measures
 
 
-def _compared(
+def floor_between(measure: Measure, parts: list[Statistics]) -> Measures:
+    """The mean distance between a picture's parts, of each from each: the other way round a distance may be another one."""
+    return _mean(measure.distances(a, b) for i, a in enumerate(parts) for j, b in enumerate(parts) if i != j)
+
+
+def compared(
     measure: Measure, pictures: Iterable[Statistics], crops: list[Statistics], floor: Measures
 ) -> tuple[dict[str, tuple[float, float]], Measures]:
     """How far pictures are from an exemplar's crops, and each from the one before it, over a floor.

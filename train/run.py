@@ -27,7 +27,7 @@ import numpy as np
 import torch
 
 from solidgrain.runtime.errors import TrainingError
-from solidgrain.runtime.files import locked, remove_temporaries, replacing
+from solidgrain.runtime.files import DAMAGED_ARRAY, locked, remove_temporaries, replacing
 from solidgrain.train import settings as settings_module
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.packing import pack, unpack
@@ -107,6 +107,10 @@ def read_checkpoint(path: Path, wanted: Collection[str]) -> dict[str, Any]:
         state: dict[str, Any] = torch.load(io.BytesIO(unpack(path.read_bytes())), map_location="cpu", weights_only=True)
         if missing := set(wanted) - state.keys():
             raise KeyError(f"no {', '.join(sorted(missing))}")
+    except OSError as error:
+        raise TrainingError(f"{path}: cannot read ({error.strerror})") from error
+    except MemoryError:
+        raise
     except Exception as error:  # torch raises a dozen unrelated types for damaged files
         raise TrainingError(f"{path}: damaged checkpoint ({type(error).__name__}); start the run again elsewhere") from error
     return state
@@ -244,7 +248,9 @@ def opening(folder: Path) -> Iterator[dict[str, Any]]:
         raise TrainingError(f"{folder}: not a run directory (no {OPTIONS}); expected a folder made by solidgrain train --out")
     try:
         yield dict(json.loads((folder / OPTIONS).read_text("utf-8")))
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+    except PermissionError as error:
+        raise TrainingError(f"{error.filename}: cannot read ({error.strerror})") from error
+    except (*DAMAGED_ARRAY, KeyError, TypeError) as error:
         raise TrainingError(f"{folder}: damaged run directory ({error}); start the run again elsewhere") from error
 
 

@@ -13,6 +13,8 @@ from solidgrain.runtime.errors import TrainingError
 class Settings:
     """What a run depends on besides its exemplar and its budget; saved as `options.json`.
 
+    A default is what runs of earlier versions mean where they do not say, and never changes. What `fast` is today, `FAST` says.
+
     Rates follow `rate(k) = max(floor, start * 0.5 ** (k / half_life))` at iteration k, and alpha likewise, down to 0; a
     half-life of 0 keeps them constant.
     """

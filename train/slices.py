@@ -30,6 +30,11 @@ def flat_slice(size: int, device: torch.device) -> Tensor:
     return torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
 
 
+def as_images(rgb: Tensor, size: int) -> Tensor:
+    """The colours [B, size², 3] at a slice's points, as images [B, 3, size, size]."""
+    return rgb.reshape(-1, size, size, 3).permute(0, 3, 1, 2)
+
+
 def scatter(images: int, places: int, generator: torch.Generator) -> Tensor:
     """Points [images, places, 3] so far apart that the solid's colours there are as good as independent."""
     return REACH * torch.rand(images, places, 3, generator=generator, device=generator.device)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from solidgrain.runtime.errors import TrainingError
-from solidgrain.runtime.files import replacing
+from solidgrain.runtime.files import DAMAGED_ARRAY, replacing
 from solidgrain.train.collection import Member, choose_held_out
 from solidgrain.train.run import (
     EXEMPLARS,
@@ -112,7 +112,7 @@ def allow_open_files(count: int) -> None:
 def _read_member(path: Path, entry: dict[str, Any]) -> Member:
     try:
         pixels = np.lib.format.open_memmap(path, mode="r")
-    except (OSError, ValueError, EOFError) as error:
+    except DAMAGED_ARRAY as error:
         raise TrainingError(f"{path}: missing or damaged ({error}); put it back, or start the run again elsewhere") from error
     if pixels_sha256(pixels) != entry["sha256"]:
         raise TrainingError(f"{path}: not the pixels that the run was started with (sha256 differs)")

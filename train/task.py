@@ -11,11 +11,13 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from solidgrain.runtime.errors import TrainingError
 from solidgrain.train import collection, exemplar
 from solidgrain.train.collection import Member
 from solidgrain.train.contrast import Stretch, stretch_to, together, unstretched
 from solidgrain.train.first_sampler import begin_as
 from solidgrain.train.noise import Noise, draw_noise
+from solidgrain.train.plateau import Onlooker
 from solidgrain.train.run import Run, RunFolder
 from solidgrain.train.sampler import Sampler, make_sampler
 from solidgrain.train.settings import Settings
@@ -64,6 +66,9 @@ class Task(Protocol):
 
     def probe(self) -> Probe: ...
 
+    def onlooker(self) -> Onlooker:
+        """Who tells when it gets no better. Raises TrainingError if nobody can."""
+
     def shown(self) -> Sequence[tuple[Tensor, tuple[Tensor, ...]]]:
         """What a sample shows: exemplars [3, H, W], with what the model needs besides noise and points for each."""
 
@@ -100,7 +105,7 @@ class SingleExemplar:
 
     def make_model(self, generator: torch.Generator) -> nn.Module:
         sampler = make_sampler(self.settings, generator)
-        if self.settings.principal_colors:
+        if self.settings.principal_colors:  # not only in `begin`: checkpoints of earlier versions do not hold these axes
             pixels = self.exemplar.flatten(1).double()
             sampler.take_colors(pixels.mean(1), torch.cov(pixels))
         return sampler
@@ -125,6 +130,9 @@ class SingleExemplar:
 
     def probe(self) -> Probe:
         return Probe(_probe_inputs(self.settings, 1, self.device), [self.exemplar])
+
+    def onlooker(self) -> Onlooker:
+        return Onlooker(self.settings, self.run.exemplar, self.device)
 
     def shown(self) -> Sequence[tuple[Tensor, tuple[Tensor, ...]]]:
         return [(self.exemplar, ())]
@@ -167,6 +175,9 @@ class TextureSpace:
         generator = torch.Generator(self.device).manual_seed(7)
         seen = [member.crop(self.settings.encoded_patch, generator) for member in self.members[:SHOWN]]
         return Probe((*_probe_inputs(self.settings, len(seen), self.device), torch.stack(seen)), seen)
+
+    def onlooker(self) -> Onlooker:
+        raise TrainingError(f"{self.run.folder}: a plateau is told of a single exemplar; give a space iterations or minutes")
 
     def shown(self) -> Sequence[tuple[Tensor, tuple[Tensor, ...]]]:
         generator = torch.Generator(self.device).manual_seed(7)

@@ -53,18 +53,13 @@ def warm_start(run: RunFolder, found: dict[str, Any], device: torch.device) -> t
 def _take_over(model: nn.Module, state: dict[str, Tensor]) -> set[str]:
     """Copy what has the same name and shape. The names."""
     wanted = model.state_dict()
-    fitting = {
-        name: value for name, value in _renamed(state, wanted).items() if name in wanted and value.shape == wanted[name].shape
-    }
+    to_space, from_space = ("sampler.directions" in names for names in (wanted, state))
+    if not (to_space and from_space):  # the axes of the colours are those of the new exemplars
+        state = {name: value for name, value in state.items() if not name.endswith(COLORS)}
+    if from_space and not to_space:  # a space keeps its sampler under a name of its own
+        state = {name.removeprefix("sampler."): value for name, value in state.items()}
+    elif to_space and not from_space and "directions" in state:
+        state = {f"sampler.{name}": value for name, value in state.items()}
+    fitting = {name: value for name, value in state.items() if name in wanted and value.shape == wanted[name].shape}
     model.load_state_dict({**wanted, **fitting})
     return set(fitting)
-
-
-def _renamed(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The state under the names of a model of the other kind: a space keeps its sampler under a name of its own."""
-    if "sampler.directions" in wanted and "sampler.directions" in state:
-        return state
-    own = {name: value for name, value in state.items() if not name.endswith(COLORS)}
-    if "sampler.directions" in wanted and "directions" in state:
-        return {f"sampler.{name}": value for name, value in own.items()}
-    return {name.removeprefix("sampler."): value for name, value in own.items()}

@@ -11,7 +11,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from solidgrain.train.inception import Inception
 from solidgrain.train.loop import train
 from solidgrain.train.noise import Noise, runtime_noise
 from solidgrain.train.run import Run, RunFolder, Source, create_run, open_run
-from solidgrain.train.settings import Budget, Settings
+from solidgrain.train.settings import Budget, Settings, from_json
 from solidgrain.train.slices import UNIT, flat_slice
 from solidgrain.train.task import make_task
 from solidgrain.train.vgg import find_weights
@@ -115,6 +115,34 @@ class Trained:
     @property
     def facts(self) -> dict[str, Any]:
         return {"iterations": self.iterations, "minutes": round(self.minutes, 2), "diverged": self.diverged}
+
+
+def finish(
+    result: Path,
+    folder: Path,
+    settings: Settings,
+    exemplar: FloatArray,
+    budget: Budget,
+    device: torch.device,
+    facts: Mapping[str, Any],
+    measured: Callable[[Sample], Mapping[str, Any]],
+) -> None:
+    """Train in a folder and measure what was learned, unless that was done before. `facts` stand in the result as they are.
+
+    Raises UsageError if it was done with other settings.
+    """
+    if (before := kept(result)) is not None:
+        if from_json(before["settings"]) != settings:
+            raise UsageError(f"--resume: {result} is of other settings, those of an earlier version; choose another --out")
+        return
+    title = f"{folder.parent.name}, {folder.name}"
+    say(f"{title}: training")
+    run = trained(folder, settings, exemplar, budget, device)
+    found: dict[str, Any] = {**facts, **run.facts, "settings": asdict(settings)}
+    if run.iterations:
+        say(f"{title}: {run.iterations} iterations; measuring")
+        found |= measured(sampling(run.run, device))
+    keep(result, found)
 
 
 def trained(folder: Path, settings: Settings, exemplar: FloatArray, budget: Budget, device: torch.device) -> Trained:

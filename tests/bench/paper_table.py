@@ -22,6 +22,7 @@ import torch
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.files import replacing
 from solidgrain.train.begin import with_grain
+from solidgrain.train.cuts import Sample
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
 from solidgrain.train.photograph import read_exemplar
@@ -101,22 +102,17 @@ def finish_cell(
     inception: Inception | None = None,
 ) -> None:
     """Train and measure one method on one exemplar, unless that was done before."""
-    result = folder / f"{column}.json"
-    if result.exists():
-        return
-    cells.say(f"{folder.name}, {column}: training")
     settings = with_grain(COLUMNS[column], "auto" if folder.name == "wood" else None, exemplar)
-    run = cells.trained(folder / column, settings, exemplar, budget, device)
-    found: dict[str, Any] = {"method": column, **run.facts, "settings": asdict(settings)}
-    if run.iterations:
-        cells.say(f"{folder.name}, {column}: {run.iterations} iterations; measuring {2 * slices} slices")
-        sample = cells.sampling(run.run, device)
-        found["quality"] = asdict(evaluate(exemplar, sample, slices, settings.grain, inception))
+
+    def measured(sample: Sample) -> dict[str, Any]:
         cells.write_png(folder / f"{column}.png", slice_picture(sample, settings.grain))
-    cells.keep(result, found)
+        return {"quality": asdict(evaluate(exemplar, sample, slices, settings.grain, inception))}
+
+    result = folder / f"{column}.json"
+    cells.finish(result, folder / column, settings, exemplar, budget, device, {"method": column}, measured)
 
 
-def slice_picture(sample: Any, grain: str, size: int = 256) -> FloatArray:
+def slice_picture(sample: Sample, grain: str, size: int = 256) -> FloatArray:
     """An oblique slice of instance 0, or one that holds the grain."""
     oblique = (
         from_quaternions(torch.tensor([[0.5, 0.1, 0.7, 0.5]]))[0] if grain == "none" else upright(grain, torch.device("cpu"))[0]

@@ -28,7 +28,9 @@ from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.files import replacing
 from solidgrain.train import exemplar as exemplar_module
 from solidgrain.train.begin import with_grain
+from solidgrain.train.cuts import Sample
 from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.inception import Inception
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import evaluate
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings
@@ -61,7 +63,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "critic": ("D starts from N(0,1)", as_paper("critic_start")),
     "sampler": ("S starts from N(0,1)", from_noise()),
     "octaves": ("the same, with 16 octaves", from_noise("octaves")),
-    "octave-span": ("the same, octaves 2^i", from_noise("octave_span")),
+    "octave-span": ("the same, 16 octaves 2^i", from_noise("octaves", "octave_span")),
     "orthogonal": ("the same, T_i from N(0,1)", from_noise("orthogonal_start")),
     "contrast": ("D sees colours as they are", as_paper("critic_contrast")),
     "colors": ("S speaks red, green, blue", as_paper("principal_colors")),
@@ -88,11 +90,16 @@ ROWS: dict[str, tuple[str, Settings]] = {
 def main(argv: Sequence[str] | None = None) -> None:
     arguments = parse(argv)
     chosen = arguments.exemplar if arguments.exemplar or arguments.anisotropic else DEFAULTS
+    names = [path.stem for path in (*chosen, *arguments.anisotropic)]
+    if len(set(names)) < len(names):
+        raise UsageError(
+            f"--exemplar, --anisotropic: two photographs of the same name ({', '.join(sorted(names))}); rename one"
+        )
     exemplars = {path.stem: middle(path, arguments.largest) for path in chosen}
     grained = {path.stem: middle(path, arguments.largest) for path in arguments.anisotropic}
     changes = dict(arguments.set)
     asked = {"marks": arguments.marks, "by": arguments.by, "largest": arguments.largest} | ({"set": changes} if changes else {})
-    device, _ = cells.prepare(arguments, **asked)
+    device, inception = cells.prepare(arguments, **asked)
     for seed in range(arguments.seeds):
         for row in arguments.only or ROWS:
             for name, exemplar in (exemplars | grained).items():
@@ -100,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 settings = with_grain(settings, "auto" if name in grained else None, exemplar)
                 folder = arguments.out / row / f"{name}-{seed}"
                 for mark in arguments.marks:
-                    finish_mark(folder, settings, exemplar, mark, arguments.by, arguments.slices, device)
+                    finish_mark(folder, settings, exemplar, mark, arguments.by, arguments.slices, device, inception)
                     write_results(arguments.out, arguments.marks, arguments.by)
     if len(arguments.marks) > 1:
         found = found_in(arguments.out)
@@ -136,6 +143,7 @@ def parse_setting(text: str) -> tuple[str, Any]:
     """A setting and its value, of the type that it has in the preset."""
     name, _, value = text.partition("=")
     preset = asdict(FAST)
+    del preset["seed"]  # --seeds has it
     try:
         kind = type(preset[name])
         return name, {"true": True, "false": False}[value] if kind is bool else kind(value)
@@ -151,19 +159,24 @@ def middle(path: Path, largest: int) -> FloatArray:
 
 
 def finish_mark(
-    folder: Path, settings: Settings, exemplar: FloatArray, mark: float, by: str, slices: int, device: torch.device
+    folder: Path,
+    settings: Settings,
+    exemplar: FloatArray,
+    mark: float,
+    by: str,
+    slices: int,
+    device: torch.device,
+    inception: Inception | None = None,
 ) -> None:
     """Train one row on one exemplar until a mark, and measure, unless that was done before."""
     result = folder.with_name(f"{folder.name}-{mark:g}.json")
-    if result.exists():
-        return
-    cells.say(f"{folder.parent.name}, {folder.name}: {mark:g} {by}")
     budget = Budget(minutes=mark) if by == "minutes" else Budget(iterations=round(mark))
-    run = cells.trained(folder, settings, exemplar, budget, device)
-    found: dict[str, Any] = {"exemplar": folder.name, "mark": mark, **run.facts, "settings": asdict(settings)}
-    if run.iterations:
-        found["quality"] = asdict(evaluate(exemplar, cells.sampling(run.run, device), slices, settings.grain))
-    cells.keep(result, found)
+
+    def measured(sample: Sample) -> dict[str, Any]:
+        return {"quality": asdict(evaluate(exemplar, sample, slices, settings.grain, inception))}
+
+    facts = {"exemplar": folder.name, "mark": mark}
+    cells.finish(result, folder, settings, exemplar, budget, device, facts, measured)
 
 
 def write_results(out: Path, marks: Sequence[float], by: str) -> None:

@@ -109,6 +109,13 @@ def test_the_checkpoint_of_an_earlier_version_is_taken_up(tmp_path, photograph):
     assert [name for name, value in tensors(state) if not torch.equal(dict(tensors(found))[name], value)] == []
 
 
+def test_a_checkpoint_that_cannot_be_read_is_not_called_damaged(tmp_path, photograph):
+    run = new_run(tmp_path / "run", photograph)
+    (tmp_path / "run" / "checkpoint.pt").mkdir()
+    with pytest.raises(TrainingError, match=r"checkpoint\.pt: cannot read \(Is a directory\)"):
+        run.load_checkpoint()
+
+
 @pytest.mark.parametrize("harm", [lambda content: content[:-100], lambda content: content[:5000] + content[6000:]])
 def test_a_damaged_checkpoint_is_one_line(tmp_path, photograph, harm):
     run = new_run(tmp_path / "run", photograph)

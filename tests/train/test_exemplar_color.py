@@ -267,6 +267,14 @@ def test_an_exr_of_no_known_space_is_told_and_taken_as_linear(tmp_path, header, 
     np.testing.assert_allclose(photograph.pixels, encode(linear), atol=3e-4)
 
 
+@pytest.mark.parametrize("kind", [oiio.FLOAT, oiio.DOUBLE], ids=str)
+def test_a_float_file_that_declares_nothing_is_linear(tmp_path, kind):
+    write(tmp_path / "linear.tif", np.full((64, 64, 3), 0.2140, np.float32), kind)
+    photograph = read_photograph(tmp_path / "linear.tif", 64)
+    np.testing.assert_allclose(photograph.pixels, 0.5, atol=1e-3)
+    assert photograph.colorspace == "lin_rec709_scene"
+
+
 CONFIG = """ocio_profile_version: 2
 environment: {}
 roles: {default: plate}

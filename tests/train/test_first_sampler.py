@@ -52,6 +52,13 @@ def test_it_is_the_space_s_texture_in_the_exemplar_s_colours(principal):
     np.testing.assert_allclose(rgb[inside], fitted, atol=1e-3)
 
 
+def test_a_bundle_of_that_name_in_the_working_directory_is_not_the_embedded_space(tmp_path, monkeypatch):
+    (tmp_path / "stone").mkdir()
+    (tmp_path / "stone" / "manifest.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    begin_as(fresh(), "stone", blotches(140, 140))
+
+
 def test_a_grain_stretches_the_octaves():
     plain, grained, exemplar = fresh(), fresh(grain="x", grain_ratio=0.25), blotches(140, 140)
     begin_as(plain, "stone", exemplar)

@@ -103,12 +103,13 @@ def test_fair_planes_of_wood_hold_the_grain_and_stay_near_the_exemplar_s():
 def test_the_truth_itself_scores_one_and_another_solid_far_more(small, monkeypatch):
     monkeypatch.setattr(ground_truth, "TRUE_SLICES", 8)  # the Gram distances of three may be all alike by chance
     look = ground_truth.true("marble")
-    itself = ground_truth.compare("marble", lambda seed, rotation: look(seed + 500, rotation), slices=4)
+    itself = ground_truth.compare("marble", lambda seed, rotation: look(seed + 900, rotation), slices=4)
     other = ground_truth.compare("marble", ground_truth.true("granite"), slices=2)
     for measure in ("gram", "patches", "color"):
         assert 0.5 < itself["unseen"][measure][0] < 1.3
         assert other["unseen"][measure][0] > 2.5 * itself["unseen"][measure][0]
     assert itself["orientation"]["gram"][0] < 2
+    assert 0.5 < itself["seen_floor"]["gram"] < 2
 
 
 def test_a_comparison_is_made_once_and_goes_on_where_it_was_stopped(small, tmp_path, capsys, monkeypatch):
@@ -121,6 +122,6 @@ def test_a_comparison_is_made_once_and_goes_on_where_it_was_stopped(small, tmp_p
     assert (tmp_path / "granite.json").stat().st_mtime_ns == before
     found = json.loads((tmp_path / "table.json").read_text())
     assert found["wood"]["settings"]["grain"] == "x"
-    assert set(found["granite"]["quality"]) >= {"floor", "seen", "unseen", "orientation"}
+    assert set(found["granite"]["quality"]) >= {"floor", "seen", "unseen", "orientation", "seen_floor"}
     assert "| measure | floor of the truth | unseen planes |" in capsys.readouterr().out
     assert (tmp_path / "wood.png").exists()

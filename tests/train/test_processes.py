@@ -77,7 +77,12 @@ def test_the_averaged_gradient_is_that_of_all_batches_in_one_process(found):
 def test_all_processes_hold_the_same_weights_and_report_the_same_losses(found):
     first, second = (process["whole"] for process in found)
     assert differing(first["weights"], second["weights"]) == []
-    assert first["style"] == second["style"]
+    assert first["seconds"] == second["seconds"]
+
+
+def test_all_processes_begin_with_what_the_first_one_has(found):
+    for process in found:
+        assert all(not tensor.any() for tensor in process["shared"])
 
 
 def test_each_process_draws_batches_of_its_own(found):

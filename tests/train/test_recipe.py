@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import OpenImageIO as oiio
@@ -117,6 +117,19 @@ def test_marks_may_be_iterations(small, tmp_path, capsys):
     assert "the preset, 3 iterations: axis-aligned / oblique" in capsys.readouterr().out
 
 
+def test_what_another_version_s_settings_made_is_not_mixed_with_today_s(small, tmp_path, capsys, monkeypatch):
+    recipe.main(small)
+    changed = {row: (title, replace(settings, alpha=0.5)) for row, (title, settings) in recipe.ROWS.items()}
+    monkeypatch.setattr(recipe, "ROWS", changed)
+    assert cells.reported(lambda: recipe.main([*small, "--resume"])) == 2
+    assert "blotches-0-0.01.json is of other settings" in capsys.readouterr().err
+
+
+def test_two_photographs_of_one_name_are_refused(small, tmp_path, capsys):
+    assert cells.reported(lambda: recipe.main([*small, "--anisotropic", str(tmp_path / "blotches.png")])) == 2
+    assert "two photographs of the same name (blotches, blotches)" in capsys.readouterr().err
+
+
 def test_half_an_iteration_is_refused_in_one_line(small, tmp_path, capsys):
     assert cells.reported(lambda: recipe.main([*small, "--by", "iterations"])) == 2
     assert "--marks 0.01,0.02: expected whole numbers of iterations" in capsys.readouterr().err
@@ -145,7 +158,7 @@ def test_a_setting_may_be_another_one_in_all_rows(small, tmp_path, capsys):
         assert (settings["sampler_rate"], settings["gram_energy"]) == (8e-3, False)
     assert cells.reported(lambda: recipe.main([*flags, "--resume"])) == 2
     assert "was started with other set" in capsys.readouterr().err
-    for wrong in ("sampler_rat=1", "sampler_rate=fast", "gram_energy=1", "alpha"):
+    for wrong in ("sampler_rat=1", "seed=1", "sampler_rate=fast", "gram_energy=1", "alpha"):
         with pytest.raises(SystemExit):
             recipe.parse(["--set", wrong])
         assert f"expected a setting of train/settings.py and its value, found '{wrong}'" in capsys.readouterr().err

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from solidgrain.runtime import TrainingError
-from solidgrain.train import critic, preview, settings, space_run
+from solidgrain.train import collection, critic, preview, settings, space_run
 from solidgrain.train.collection import LEVELS
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.run import open_run
@@ -200,7 +200,7 @@ def test_photographs_with_a_frame_are_named(solidgrain, tmp_path, small_presets)
     outcome = solidgrain("train", "--space", folder, "--out", tmp_path / "run", *SMALL, "--iterations", 1)
     assert outcome.code == 0, outcome.err
     (warning,) = [line for line in outcome.err.splitlines() if "of 3 photographs seem to have a frame" in line]
-    assert "3 times as much as further in): framed.png (" in warning
+    assert "(edge step above 3): framed.png (" in warning
 
 
 def test_held_out_photographs_that_the_warm_start_has_seen_are_named(solidgrain, tmp_path, small_presets):
@@ -214,14 +214,42 @@ def test_held_out_photographs_that_the_warm_start_has_seen_are_named(solidgrain,
     outcome = solidgrain("train", "--space", tmp_path / "stones", "--hold-out", 1, "--out", tmp_path / "fourth", *begin)
     assert "what it was trained on is not known; held-out photographs may be among it" in outcome.err
     assert open_space_run(tmp_path / "second").settings.warm_start == "first"
+    flags[-3] = tmp_path / "second"  # which began with another one itself
+    outcome = solidgrain("train", *flags, "--out", tmp_path / "fifth")
+    assert f"{tmp_path / 'second'}: what it began with was trained on is not known" in outcome.err
     assert "held-out photographs" not in solidgrain("train", *flags[:-4], "--out", tmp_path / "third").err
+
+
+def test_a_held_out_photograph_that_a_single_exemplar_s_run_was_of_is_named(solidgrain, tmp_path, small_presets):
+    folder, small = photographs(tmp_path / "stones", 3), ["--iterations", 1, "--threads", 1]
+    (tmp_path / "unseen.txt").write_text("stone1.png\n")
+    assert solidgrain("train", folder / "stone1.png", "--out", tmp_path / "single", *small, "--patch", 32).code == 0
+    flags = ["--hold-out", tmp_path / "unseen.txt", "--warm-start", tmp_path / "single"]
+    outcome = solidgrain("train", "--space", folder, "--out", tmp_path / "run", *flags, *small)
+    assert f"1 held-out photographs were trained on by {tmp_path / 'single'}: stone1.png" in outcome.err
+
+
+def test_a_misspelt_held_out_name_is_refused_before_photographs_are_read(solidgrain, tmp_path, monkeypatch):
+    monkeypatch.setattr(collection, "read_photograph", lambda *_: pytest.fail("was read"))
+    (tmp_path / "unseen.txt").write_text("ston1.png\n")
+    flags = ["--out", tmp_path / "run", "--hold-out", tmp_path / "unseen.txt"]
+    outcome = solidgrain("train", "--space", photographs(tmp_path / "stones", 3), *flags)
+    assert outcome.code == 1
+    assert "there is no readable photograph ston1.png" in outcome.error
+    assert not (tmp_path / "run").exists()
+
+
+def test_no_plateau_is_told_of_a_space(tmp_path):
+    run = new_space(tmp_path / "run", sample_every=1000)
+    with pytest.raises(TrainingError, match="a plateau is told of a single exemplar"):
+        train(run, Budget(iterations=30, until_plateau=True), CPU)
 
 
 def test_a_space_has_budgets_and_settings_of_its_own(solidgrain, tmp_path, monkeypatch):
     """Many more iterations, 32 octaves, slower rates; the paper's octaves spread as 2^(i/2)."""
     from solidgrain.train import loop
 
-    monkeypatch.setattr(loop, "train", lambda *_: None)
+    monkeypatch.setattr(loop, "train", lambda *_: loop.Ending(0, saved=False, stopped=False))
     folder = photographs(tmp_path / "stones", 2)
     for name, iterations, span in (("fast", 30_000, 7.0), ("paper", 300_000, 15.5)):
         solidgrain("train", "--space", folder, "--out", tmp_path / name, "--preset", name, "--anisotropic", "x")
@@ -346,6 +374,11 @@ def zip_up(path):
         np.savez(file, np.zeros(3))
 
 
+def break_header(path):
+    """So that NumPy raises what its tokenizer does."""
+    path.write_bytes(path.read_bytes().replace(b"}", b" ", 1))
+
+
 @pytest.mark.parametrize(
     ("harm", "message"),
     [
@@ -356,6 +389,7 @@ def zip_up(path):
         (swap, "not the pixels that the run was started with"),
         (lambda path: np.save(path, np.zeros((130, 130, 3))), "not the pixels that the run was started with"),
         (zip_up, "missing or damaged"),
+        (break_header, "missing or damaged"),
     ],
 )
 def test_an_exemplar_that_was_tampered_with_is_named_in_one_line(solidgrain, tmp_path, harm, message):

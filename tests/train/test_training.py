@@ -28,6 +28,7 @@ from solidgrain.train import run as run_module
 from solidgrain.train.exemplar import edge_step
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.photograph import read_exemplar
+from solidgrain.train.precision import use_bfloat16
 from solidgrain.train.run import Source, create_run, held, open_run, pixels_sha256
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import Budget, preset
@@ -132,9 +133,9 @@ def test_bfloat16_is_chosen_where_it_is_faster(monkeypatch):
         monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda amx=amx: amx)
         capabilities = {"avx512_bf16": avx512} | ({"cpu_name": cpu} if cpu else {})
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda found=capabilities: found, raising=False)
-        assert loop.use_bfloat16(preset("fast"), CPU) is faster
+        assert use_bfloat16(preset("fast"), CPU) is faster
         for precision in ("float32", "bfloat16"):
-            assert loop.use_bfloat16(replace(preset("fast"), precision=precision), CPU) is (precision == "bfloat16")
+            assert use_bfloat16(replace(preset("fast"), precision=precision), CPU) is (precision == "bfloat16")
 
 
 def test_later_patches_are_larger_where_the_exemplar_has_room(tmp_path, photograph):
@@ -384,6 +385,16 @@ def test_below_the_checkout_of_another_project_the_revision_is_the_version_alone
     assert re.fullmatch(r"\S+ \([0-9a-f]{7,}-dirty\)", run_module.source_revision())
 
 
+def test_a_training_that_was_finished_is_not_called_stopped(tmp_path, photograph, solidgrain, monkeypatch):
+    """Ctrl-C while its last checkpoint is written."""
+    new_run(tmp_path / "run", photograph)
+    asked = iter([False, False])
+    monkeypatch.setattr(command.StopRequest, "requested", lambda self: next(asked, True))
+    outcome = solidgrain("train", "--resume", tmp_path / "run", "--iterations", 2, "--threads", 1)
+    assert outcome.code == 0
+    assert f"done; next: solidgrain export {tmp_path / 'run'}" in outcome.err
+
+
 def test_who_resumes_with_another_budget_is_told_it_again(tmp_path, photograph, solidgrain, monkeypatch):
     new_run(tmp_path / "run", photograph)
     monkeypatch.setattr(command.StopRequest, "requested", lambda self: True)
@@ -481,6 +492,7 @@ def test_resuming_keeps_the_run_s_budget_and_refuses_other_settings(solidgrain, 
         ("options.json", b"hello", "damaged run directory"),
         ("exemplar.npy", b"", "damaged run directory"),
         ("exemplar.npy", None, "damaged run directory"),
+        ("exemplar.npy", b"\x93NUMPY\1\0v\0" + b"{'descr': '<f4', (".ljust(117) + b"\n", "damaged run directory"),
         ("checkpoint.pt", b"", "damaged checkpoint"),
     ],
 )
@@ -542,7 +554,7 @@ def test_a_frame_gets_a_warning_that_names_the_figure(solidgrain, tmp_path):
     oiio.ImageBuf(framed).write(os.fspath(tmp_path / "framed.png"), oiio.UINT8)
     flags = ["--out", tmp_path / "run", "--iterations", 1, "--patch", 32, "--batch", 1]
     outcome = solidgrain("train", tmp_path / "framed.png", *flags)
-    said = re.search(r"framed.png seems to have a frame: .* differ (.*) times as much as further in \(above 3\)", outcome.err)
+    said = re.search(r"framed.png seems to have a frame \(edge step (.*), above 3\); crop it off", outcome.err)
     assert float(said[1]) == pytest.approx(edge_step(framed), abs=0.1)
 
 

@@ -59,13 +59,11 @@ def weights(trainer):
 
 
 def trained(folder: Path, processes: Processes, *sittings: int):
-    endings = [
-        train(open_space_run(folder), Budget(iterations=until), CPU, processes=processes, on_report=lambda report: None)
-        for until in sittings
-    ]
+    for until in sittings:
+        train(open_space_run(folder), Budget(iterations=until), CPU, processes=processes)
     trainer = Trainer(open_space_run(folder), CPU, processes)
     trainer.load()
-    return {"weights": weights(trainer), "stream": trainer.generator.get_state(), "style": endings[-1].report.style}
+    return {"weights": weights(trainer), "stream": trainer.generator.get_state(), "seconds": trainer.seconds}
 
 
 def interrupt_itself(after: int) -> None:
@@ -79,6 +77,14 @@ def interrupt_itself(after: int) -> None:
         return report
 
     Trainer.step = interrupted
+
+
+def shared(processes):
+    """What the first process has, given to all."""
+    mine = [torch.full((2, 3), float(processes.rank)), torch.full((1, 4, 2, 2), float(processes.rank))]
+    mine[1] = mine[1].contiguous(memory_format=torch.channels_last)
+    processes.share(mine)
+    return mine
 
 
 def failing_in(rank, processes):
@@ -105,6 +111,7 @@ def main() -> None:
         found = {
             "alone": gradients_of(torch.cat([images(0), images(1)]), Processes()),
             "together": gradients_of(images(processes.rank), processes),
+            "shared": shared(processes),
             "fails in 0": failing_in(0, processes),
             "fails in 1": failing_in(1, processes),
             "fails nowhere": failing_in(None, processes),
