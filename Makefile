@@ -57,7 +57,7 @@ bench: install
 	$(BIN)/python -m tests.bench.bench $(FLAGS)
 
 bench-bake: install
-	$(BIN)/python -m tests.bench.bakes --large
+	$(BIN)/python -m tests.bench.bakes --large $(FLAGS)
 
 # Hours unattended, and again after a kill: finished cells are kept (docs/experiments.md says how long they take).
 MINUTES ?= 20

@@ -29,15 +29,14 @@ class Figures:
 
 def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
     rows = []
-    turned = (f"exemplar {evaluation.turn}",) if evaluation.turned else ()  # what earlier versions found has none
-    among = ("slices from each other",) if evaluation.among else ()  # nor these; nor has a single slice
+    among = ("slices from each other",) if evaluation.among else ()  # a single slice has none
     for name, floor in evaluation.floor.items():
         spreads = (evaluation.axis[name], evaluation.oblique[name])
         rows.append(
             (
                 name,
                 f"{floor:.4g}",
-                *(f"{evaluation.turned[name]:.2f}" for _ in turned),
+                f"{evaluation.turned[name]:.2f}",
                 *(f"{mean:.2f} ± {deviation:.2f}" for mean, deviation in spreads),
                 *(f"{evaluation.among[name]:.2f}" for _ in among),
             )
@@ -47,7 +46,7 @@ def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
     return Figures(
         f"Distances to the exemplar over its own floor, mean ± standard deviation over {evaluation.slices} slices of "
         f"{evaluation.crop}² pixels, through the runtime:",
-        ("measure", "floor", *turned, "axis-aligned slices", "oblique slices", *among),
+        ("measure", "floor", f"exemplar {evaluation.turn}", "axis-aligned slices", "oblique slices", *among),
         rows,
         f"{about(copying)}{change * uneven}",
     )

@@ -51,7 +51,7 @@ class Evaluation:
     floor: Measures
     axis: dict[str, tuple[float, float]]
     oblique: dict[str, tuple[float, float]]
-    turned: Measures = field(default_factory=dict)  # the exemplar itself, as `turn` says: far above 1 where it has a direction
+    turned: Measures  # the exemplar itself, as `turn` says: far above 1 where it has a direction
     nonstationarity: float = 0.0  # of the exemplar
     grain: str = "none"  # the image axis about which slices turn
     among: Measures = field(default_factory=dict)  # each oblique slice from the next: at 1 they vary as the exemplar's parts do

@@ -69,7 +69,8 @@ def measured(texture, exemplar, slices):
     """Stands in for `measure`: a texture is as far from its photograph as that is bright."""
     bright = float(exemplar.mean())
     found = {"gram": (bright, 0.25), "color": (1 + bright, 0.5)}
-    return Measured(Evaluation(64, slices, {"gram": 0.125, "color": 2.5}, found, found), Copying(256, 0.1, 1.25, 0.004), [])
+    floor, turned = {"gram": 0.125, "color": 2.5}, {"gram": 1.0, "color": 1.0}
+    return Measured(Evaluation(64, slices, floor, found, found, turned), Copying(256, 0.1, 1.25, 0.004), [])
 
 
 @pytest.fixture
