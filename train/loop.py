@@ -72,7 +72,6 @@ class Trainer:
         self.watch = Watch(settles=0 if self.settings.critic_start else SETTLING)
         self.plateau, self.setbacks = Plateau(), 0
         self.onlooker: Onlooker | None = None  # until it is needed
-        processes.share(tensor for part in (self.critic, self.sampler, self.average) for tensor in part.state_dict().values())
         if processes.rank:
             self._draw_anew(processes.rank)  # the same networks everywhere, batches of one's own
 
@@ -203,9 +202,11 @@ class Trainer:
         self.processes.gathered(None)  # nobody goes on, and perhaps back to it, before it is there
 
     def load(self) -> None:
-        """Take up the run's last checkpoint, if it has one."""
+        """Take up the run's last checkpoint. Where it has none, all processes begin with the first one's weights."""
         state = self.run.load_checkpoint()
         if state is None:
+            models = (self.critic, self.sampler, self.average)
+            self.processes.share(tensor for model in models for tensor in model.state_dict().values())
             return
         try:
             for name in PARTS:
