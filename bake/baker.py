@@ -182,6 +182,7 @@ def _feed(plan: Plan, texture: Texture, jobs: Sequence[Job], workers: Workers, s
         left -= len(slab)
         on_slice(total - left, total)
 
+    on_slice(total - left, total)
     with ThreadPoolExecutor(1, thread_name_prefix="solidgrain-writers") as hand:
         try:
             for first, stop in _runs(wanted, plan.slab, shard[1]):

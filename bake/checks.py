@@ -114,7 +114,7 @@ def _check_memory(plan: Plan) -> None:
     if available is not None and plan.memory > available:
         raise BakeError(
             f"--size {format_size(plan.size)}: one slab needs {format_bytes(plan.memory)} of memory, "
-            f"{format_bytes(available)} are available; bake a smaller x by y"
+            f"{format_bytes(available)} are available; bake a smaller x by y, or where files lie across them, less depth"
         )
 
 
@@ -139,9 +139,31 @@ def _check_disk(plan: Plan, shard: tuple[int, int] | None) -> None:
 
 def available_memory() -> int | None:
     """Bytes that this process could still take, or None where the system does not tell."""
+    of_machine = _fields(Path("/proc/meminfo")).get("MemAvailable:")
+    limits = [] if of_machine is None else [1024 * of_machine]
+    return min(limits + _left_by_groups(), default=None)
+
+
+def _left_by_groups(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> list[int]:
+    """What the control groups of this process, a container's or a job's, still allow it (Linux, cgroup v2)."""
     try:
-        lines = Path("/proc/meminfo").read_text("ascii").splitlines()
+        group = next(line[3:] for line in own.read_text().splitlines() if line.startswith("0::"))
+    except (OSError, StopIteration):
+        return []
+    left = []
+    for folder in (root / group.strip("/"), *(root / group.strip("/")).parents):
+        try:
+            limit, used = (int((folder / name).read_text()) for name in ("memory.max", "memory.current"))
+        except (OSError, ValueError):  # none here, or "max"
+            continue
+        left.append(max(0, limit - used + _fields(folder / "memory.stat").get("inactive_file", 0)))
+    return left
+
+
+def _fields(path: Path) -> dict[str, int]:
+    """The whole numbers that a file of the kernel lists by name; none of one that is not there."""
+    try:
+        lines = [line.split() for line in path.read_text("ascii").splitlines()]
     except OSError:
-        return None
-    found = next((line for line in lines if line.startswith("MemAvailable:")), None)
-    return None if found is None else int(found.split()[1]) * 1024
+        return {}
+    return {line[0]: int(line[1]) for line in lines if len(line) > 1 and line[1].isdecimal()}

@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return _run(arguments)
     except KeyboardInterrupt:
-        resumes = any(word.startswith(("--resume", "--shard", "--dask")) for word in arguments)
+        resumes = arguments[:1] == ["merge"] or any(word.startswith(("--resume", "--shard", "--dask")) for word in arguments)
         left = "go on with the same flags" if resumes else "nothing half-written was left behind"
         tell(f"interrupted; {left}")
         return INTERRUPTED

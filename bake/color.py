@@ -57,6 +57,12 @@ def from_srgb(rgb: FloatArray, colorspace: str) -> FloatArray:
     return from_linear(to_linear(rgb), colorspace)
 
 
+def luma(linear: FloatArray) -> FloatArray:
+    """Rec.709 luma [...] of linear colours [..., 3], with sums in one order whatever the shape (those of BLAS differ)."""
+    weighted: FloatArray = linear[..., 0] * LUMA[0] + linear[..., 1] * LUMA[1] + linear[..., 2] * LUMA[2]
+    return weighted
+
+
 def to_linear(rgb: FloatArray) -> FloatArray:
     """sRGB-encoded values in [0, 1] to linear light (IEC 61966-2-1)."""
     linear: FloatArray = rgb + np.float32(0.055)

@@ -16,9 +16,10 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+from solidgrain.bake.messages import first_line
 from solidgrain.runtime.errors import BakeError, SolidgrainError
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def _run_shards(client: Client, plan: Plan, count: int, provider: str, threads: 
     from distributed import as_completed
 
     values, done = plan.to_json(), 0
+    on_slice(0, plan.size[2])
     futures = {
         client.submit(bake_shard, values, number, count, provider, threads, key=f"shard-{number}-{os.urandom(8).hex()}",
                       retries=RETRIES, pure=False): number
@@ -109,7 +111,9 @@ def bake_shard(values: dict[str, Any], number: int, count: int, provider: str, t
 
     plan = plan_of(values, "the plan of the Dask task")
     with ALONE:  # or several tasks would load it at once
-        texture = _texture(plan.source, plan.bundle, plan.precision, provider, threads or get_worker().state.nthreads)
+        each = threads or get_worker().state.nthreads
+        hashes = (plan.texture_sha256, plan.sampler_sha256)
+        texture = _texture(plan.source, plan.bundle, plan.precision, provider, each, hashes)
     check_texture(plan, texture, f"worker {socket.gethostname()}")
     shard = plan.shard(number, count)
     try:
@@ -130,9 +134,9 @@ def bake_shard(values: dict[str, Any], number: int, count: int, provider: str, t
     }
 
 
-@cache
-def _texture(source: str, bundle: str | None, precision: str, provider: str, threads: int) -> Texture:
-    """Loaded once per worker process."""
+@lru_cache(maxsize=1)  # of a worker: a texture holds the tables of its last instance
+def _texture(source: str, bundle: str | None, precision: str, provider: str, threads: int, hashes: tuple[str, str]) -> Texture:
+    """Loaded once by a worker for the plans that it bakes next; anew, where a file of the same name holds another one now."""
     from solidgrain.runtime import load_texture
 
     return load_texture(source, bundle=bundle, precision=precision, provider=provider, threads=threads)
@@ -189,7 +193,7 @@ def _check_scheduler(address: str) -> None:
     try:
         asyncio.run(asyncio.wait_for(ask(), PATIENCE))
     except Exception as error:  # the transports raise many unrelated types
-        reason = str(error).splitlines()[0] if str(error) else f"no answer in {PATIENCE:.0f} s"
+        reason = first_line(error, f"no answer in {PATIENCE:.0f} s")
         raise BakeError(f"--dask {address}: no Dask scheduler there ({reason}); start one with `dask scheduler`") from error
 
 
@@ -201,5 +205,5 @@ def _one_line(what: str) -> Iterator[None]:
     except SolidgrainError:
         raise
     except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else "no reason given"
+        reason = first_line(error, "no reason given")
         raise BakeError(f"{what}: {type(error).__name__}: {reason}") from error

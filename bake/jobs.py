@@ -248,21 +248,23 @@ def bake_jobs(
     on_error: Callable[[str], None],
     continue_on_error: bool,
 ) -> list[dict[str, Any]]:
-    """Bake one job after the other; after a failure the rest is skipped, unless told to go on. Returns a line for each job.
-
-    A texture is let go of when the last of its jobs is done.
-    """
+    """Bake one job after the other; after a failure the rest is skipped, unless told to go on. Returns a line for each job."""
     report: list[dict[str, Any]] = []
-    for number, one in enumerate(planned):
+    for one, texture in in_turn(planned, textures):
         if any(line["status"] == FAILED for line in report) and not continue_on_error:
             report.append(_line(one, SKIPPED, note="a job before it failed"))
             continue
-        report.append(_bake_job(one, textures[one.job.texture], bake))
+        report.append(_bake_job(one, texture, bake))
         if report[-1]["error"]:
             on_error(report[-1]["error"])
-        if all(later.job.texture != one.job.texture for later in planned[number + 1 :]):
-            del textures[one.job.texture]
     return report
+
+
+def in_turn(planned: Sequence[Planned], textures: dict[object, Texture]) -> Iterator[tuple[Planned, Texture]]:
+    """Each job with its texture, which is let go of after the last of its jobs: it holds the tables of an instance."""
+    for number, one in enumerate(planned):
+        needed = any(later.job.texture == one.job.texture for later in planned[number + 1 :])
+        yield one, textures[one.job.texture] if needed else textures.pop(one.job.texture)
 
 
 def _bake_job(one: Planned, texture: Texture, bake: Bake) -> dict[str, Any]:

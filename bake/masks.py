@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from solidgrain.bake.messages import first_line
 from solidgrain.runtime.errors import BakeError, UsageError
-from solidgrain.runtime.files import DAMAGED_ARRAY
+from solidgrain.runtime.files import DAMAGED_ARRAY, map_array
 
 Vector = tuple[float, float, float]
 
@@ -35,7 +36,7 @@ def read_mask(path: Path) -> MaskFile:
     if path.suffix.lower() == ".vti":
         return _image_data(path)
     try:
-        return MaskFile(np.load(path, mmap_mode="r", allow_pickle=False))
+        return MaskFile(map_array(path))
     except DAMAGED_ARRAY as error:
         raise BakeError(f"--mask {path}: not readable as a NumPy array") from error
 
@@ -47,7 +48,7 @@ def _image_data(path: Path) -> MaskFile:
     try:
         image: Any = pyvista.read(os.fspath(path))
     except Exception as error:  # VTK's readers raise several unrelated types
-        raise BakeError(f"--mask {path}: not readable as image data ({str(error).splitlines()[0]})") from error
+        raise BakeError(f"--mask {path}: not readable as image data ({first_line(error)})") from error
     arrays = [*image.point_data.items(), *image.cell_data.items()]
     if not isinstance(image, pyvista.ImageData) or len(arrays) != 1 or np.ndim(arrays[0][1]) != 1:
         names = ", ".join(f"{name} {np.shape(array)}" for name, array in arrays) or "no arrays"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from solidgrain.bake.frames import in_hashes
-from solidgrain.bake.writers import Output, Volume
+from solidgrain.bake.writers import Output, Volume, turned_bytes
 from solidgrain.runtime.bundle import MANIFEST
 
 SLAB_BYTES = 48 * 2**20  # of float32 colour; what a bake holds at a time is a small multiple of it
@@ -21,7 +21,7 @@ DITHERING = 9  # the same where noise is made, from hashes of 64 bits: 8
 AVERAGING = 3.25  # the same, times the samples per voxel: themselves, their linear light, a term of it, and where that holds
 BASE_MEMORY = 220 * 2**20  # interpreter, libraries, noise tables, the chunks in flight
 FORMAT_VERSION = 1  # of plans and manifests
-BYTES_VERSION = 4  # of what writers make of a plan: one more with every change of it
+BYTES_VERSION = 5  # of what writers make of a plan: one more with every change of it
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -77,7 +77,8 @@ class Plan:
         width, height, depth = self.size
         dithered = any(output.options.get("dither") for output in self.outputs)
         held = IN_FLIGHT + (DITHERING if dithered else ENCODING) + (AVERAGING * self.samples if self.samples > 1 else 0)
-        return BASE_MEMORY + int(held * self.slab * width * height * 12) + 64 * (width + height) + 1024 * depth
+        turned = ENCODING * max((turned_bytes(output, self.volume) for output in self.outputs), default=0)  # once all is there
+        return BASE_MEMORY + max(int(held * self.slab * width * height * 12), turned) + 64 * (width + height) + 1024 * depth
 
     def shard(self, number: int, count: int) -> tuple[int, int]:
         """The slices (first, stop) of shard `number` of `count`, counted from 1: whole slabs, none twice."""

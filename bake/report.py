@@ -60,6 +60,8 @@ def summary(report: dict[str, Any]) -> str:
         f"memory    about {format_bytes(report['memory_bytes'])}",
         f"time      about {report['seconds']:.3g} s on {report['threads']} threads, {report['provider']}",
     ]
+    if report["provider_note"]:
+        lines.append(f"          no fused kernel: {report['provider_note']}")
     if report["tile_distortion"]:
         lines.append(f"tiling    {tiling_line(plan['tile'], report['tile_distortion'])}")
     return "\n".join(lines)
@@ -87,6 +89,7 @@ def result(plan: Plan, texture: Texture, baked: Baked, shard: Shard | None = Non
         "files": [str(path) for path in baked.files],
         "color_encoding": {str(output.path): output.colorspace for output in plan.outputs},
         "provider": texture.provider,
+        "provider_note": texture.provider_note,
         "tile_distortion": tile_distortion(plan, texture),
         "seconds": round(baked.seconds, 3),
         "evaluation_seconds": round(baked.evaluation_seconds, 3),
@@ -116,11 +119,11 @@ class Progress:
         if self.quiet or not self.terminal:
             return
         if self.already < 0:
-            self.already = done - 1
+            self.already = done
         seconds = time.monotonic() - self.started
         filled = 30 * done // total
-        left = seconds * (total - done) / max(1, done - self.already)
-        sys.stderr.write(f"\r[{'#' * filled}{'.' * (30 - filled)}] slice {done}/{total}, {left:.0f} s left ")
+        left = f", {seconds * (total - done) / (done - self.already):.0f} s left" if done > self.already else ""
+        sys.stderr.write(f"\r[{'#' * filled}{'.' * (30 - filled)}] slice {done}/{total}{left} ")
         sys.stderr.flush()
 
     def end_line(self) -> None:

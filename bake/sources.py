@@ -144,10 +144,14 @@ class Encoded:
                 "the same --patch-scale and --crop"
             )
 
-    def save(self) -> None:
-        """Write the texture files that are not there, and let go of all textures. Raises BundleError if it cannot be done."""
+    def save(self, plans: Iterable[Plan]) -> None:
+        """Write the texture files that plans with outputs need and that are not there, and let go of all textures.
+
+        Raises BundleError if it cannot be done.
+        """
+        needed = {plan.source for plan in plans if plan.outputs}
         for (file, _), texture in self.textures.items():
-            if not file.exists():
+            if str(file) in needed and not file.exists():
                 self.made.append(file)
                 texture.save(file)
         self.textures.clear()

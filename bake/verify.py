@@ -73,7 +73,10 @@ def _planned(manifest: dict[str, Any], path: Path) -> tuple[Plan, Output]:
     for output in plan.outputs:
         if in_hashes(output.path).name == manifest["output"] and hash_of(plan.work(output)) == manifest["work"]:
             return plan, replace(output, path=path.parent / output.path.name)
-    raise BakeError(f"{path}: was edited, its plan is not the one of its files; bake again with --overwrite")
+    raise BakeError(
+        f"{path}: its plan is not the one of its files: it was edited, or another version of solidgrain made it; "
+        "check the files alone with --voxels 0, or bake again with --overwrite"
+    )
 
 
 def check_texture(plan: Plan, texture: Texture, where: str) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.bake.color import LINEAR, LUMA, SRGB, quantize, to_srgb
-from solidgrain.bake.messages import warn
+from solidgrain.bake.messages import first_line, warn
 from solidgrain.bake.opengl import has_display, off_screen_environment, require_opengl
 from solidgrain.runtime.errors import ViewError
-from solidgrain.runtime.files import DAMAGED_ARRAY, temporary_name
+from solidgrain.runtime.files import DAMAGED_ARRAY, map_array, temporary_name
 
 if TYPE_CHECKING:
     import pyvista
@@ -37,7 +37,7 @@ def read_volume(path: Path) -> pyvista.ImageData:
     try:
         image = pyvista.read(os.fspath(path))
     except Exception as error:  # VTK's readers raise several unrelated types
-        raise ViewError(f"{path}: not readable as a volume ({str(error).splitlines()[0]})") from error
+        raise ViewError(f"{path}: not readable as a volume ({first_line(error)})") from error
     if not isinstance(image, pyvista.ImageData) or "rgb" not in image.point_data:
         raise ViewError(f"{path}: expected image data with a point array 'rgb', found {_contents(image)}")
     colors = np.asarray(image.point_data["rgb"])
@@ -59,7 +59,7 @@ def _from_array(path: Path) -> pyvista.ImageData:
     import pyvista
 
     try:
-        array = np.load(path, allow_pickle=False, mmap_mode="r")
+        array = map_array(path)
     except DAMAGED_ARRAY as error:
         raise ViewError(f"{path}: not readable as a NumPy array") from error
     if array.ndim != 4 or array.shape[-1] != 3 or array.size == 0 or array.dtype.kind not in "fu":

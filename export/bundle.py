@@ -21,6 +21,7 @@ from solidgrain.export.space_graphs import EncoderWeights, MappingWeights, build
 from solidgrain.runtime.bundle import (
     BLEND,
     CARD,
+    COLOR_ENCODING,
     CRITIC,
     ENCODER,
     FORMAT,
@@ -143,7 +144,7 @@ def _fill(folder: Path, content: SamplerWeights | SpaceWeights, details: Details
         "width": width,
         "hidden_layers": layers,
         "patch": details.patch,
-        "color_encoding": "srgb_rec709_scene",
+        "color_encoding": COLOR_ENCODING,
         "files": {path.name: file_sha256(path) for path in sorted(folder.iterdir())},
         **facts,
         "training": details.training,

@@ -17,6 +17,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -26,7 +27,7 @@ from solidgrain.runtime.errors import BundleError
 
 MANIFEST, SAMPLER, TEXTURE, CARD = "manifest.json", "sampler.onnx", "texture.sgt.npz", "card.md"
 ENCODER, MAPPING, BLEND, CRITIC = "encoder.onnx", "mapping.onnx", "blend.onnx", "critic.npz"
-FORMAT, FORMAT_VERSION = "solidgrain-bundle", 1
+FORMAT, FORMAT_VERSION, COLOR_ENCODING = "solidgrain-bundle", 1, "srgb_rec709_scene"
 KEYS: dict[str, type] = {
     "name": str,
     "producer": str,
@@ -75,7 +76,10 @@ def open_bundle(folder: Path) -> Bundle:
         path = folder / name
         if not path.is_file():
             raise BundleError(f"{path}: missing; the manifest lists it. Export the bundle again")
-        found = file_sha256(path)
+        try:
+            found = file_sha256(path)
+        except OSError as error:
+            raise BundleError(f"{path}: cannot read ({error.strerror})") from error
         if found != expected:
             raise BundleError(
                 f"{path}: sha256 is {found[:12]}…, the manifest expects {expected[:12]}…; "
@@ -88,9 +92,11 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise BundleError(f"{path.parent}: not a bundle (no {MANIFEST}); expected a folder made by solidgrain export")
     try:
-        manifest = json.loads(path.read_text("utf-8"))
+        manifest = json.loads(path.read_bytes())
         is_bundle = manifest["format"] == FORMAT
         version = manifest["format_version"]
+    except OSError as error:
+        raise BundleError(f"{path}: cannot read ({error.strerror})") from error
     except (ValueError, KeyError, TypeError) as error:
         raise BundleError(f"{path}: not a bundle manifest ({error}); export the bundle again") from error
     if not is_bundle:
@@ -100,6 +106,8 @@ def _read_manifest(path: Path) -> dict[str, Any]:
             f"{path}: format version {version}, this solidgrain reads {FORMAT_VERSION}; export again or update solidgrain"
         )
     wrong = [key for key, kind in KEYS.items() if not isinstance(manifest.get(key), kind)]
+    if not wrong and manifest["color_encoding"] != COLOR_ENCODING:
+        raise BundleError(f"{path}: colours are {manifest['color_encoding']!r}, this solidgrain reads {COLOR_ENCODING!r}")
     if not wrong and not all(isinstance(digest, str) for digest in manifest["files"].values()):
         wrong = ["files"]
     if not wrong and not {"seed", "points", "rgb"} <= manifest["probe"].keys():
@@ -130,9 +138,17 @@ def embedded_names() -> list[str]:
 def bundle_folder(source: str) -> Path:
     """The folder of a bundle that is named by its path, or of an embedded one. Raises BundleError if there is none."""
     path = Path(source)
-    if path.is_dir() and ((path / MANIFEST).is_file() or source not in embedded_bundles()):
-        return path
+    with suppress(OSError):  # a name that is too long for a folder
+        if path.is_dir() and ((path / MANIFEST).is_file() or source not in embedded_bundles()):
+            return path
     return embedded_folder(source)
+
+
+def is_texture_file(source: str) -> bool:
+    """Whether a source is a file: neither a bundle's folder nor an embedded name, which counts before a file of that name."""
+    with suppress(OSError):
+        return source not in embedded_bundles() and Path(source).is_file()
+    return False
 
 
 def embedded_folder(name: str) -> Path:

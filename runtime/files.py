@@ -22,6 +22,15 @@ DAMAGED_ARCHIVE = (*DAMAGED_ARRAY, KeyError, TypeError, IndexError, RuntimeError
 LARGE = 2**31 - 2**20  # bytes: from here on, an archive's member needs 64-bit sizes
 
 
+def map_array(path: Path) -> npt.NDArray[Any]:
+    """An `.npy`, mapped into memory. Raises one of `DAMAGED_ARRAY` if it is none."""
+    found = np.load(path, mmap_mode="r", allow_pickle=False)
+    if not isinstance(found, np.ndarray):
+        found.close()
+        raise ValueError("an archive of arrays")
+    return found
+
+
 def temporary_name(path: Path) -> Path:
     """A hidden name beside the file that nobody else has, with the same suffix. Processes in containers share numbers."""
     return path.with_name(f".{path.stem}.{os.urandom(8).hex()}.tmp{path.suffix}")

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
-from solidgrain.runtime.bundle import bundle_folder, open_bundle
+from solidgrain.runtime.bundle import bundle_folder, is_texture_file, open_bundle
 from solidgrain.runtime.space import Space, load_space
 from solidgrain.runtime.texture import DEFAULT_TEXTURE, Texture, check_alone, load_texture
 
@@ -22,7 +21,8 @@ def load(
 
     Typed code that knows which it is calls `load_texture` or `load_space`.
     """
-    if not Path(source).is_file() and open_bundle(bundle_folder(os.fspath(source))).is_space:
-        check_alone(os.fspath(source), bundle)
+    name = os.fspath(source)
+    if not is_texture_file(name) and open_bundle(bundle_folder(name)).is_space:
+        check_alone(name, bundle)
         return load_space(source, provider=provider, precision=precision, threads=threads)
     return load_texture(source, bundle=bundle, provider=provider, precision=precision, threads=threads)

@@ -143,6 +143,7 @@ def make_mask(values: npt.ArrayLike, origin: Vector = (0.0, 0.0, 0.0), spacing: 
         if not (least >= 0 and most <= 1):
             raise EvaluationError(f"mask has values from {least:g} to {most:g}, expected 0 to 1 (0: the first texture)")
     array.flags.writeable = False
+    origin, spacing = _floats(origin), _floats(spacing)  # whose texts go into its hash
     if not np.isfinite([*origin, *spacing]).all() or min(spacing) < FINEST:
         raise EvaluationError(
             f"mask at {origin} with voxels of {spacing}: expected a place and sizes of {FINEST:g} or more, in exemplar pixels"
@@ -164,6 +165,11 @@ def make_ramp(axis: str, start: float, stop: float) -> Mask:
     shape[2 - k], spacing[k], origin[k] = 2, length, min(start, stop) - 0.5 * length
     values = np.array([0, 1] if start < stop else [1, 0], np.float32).reshape(shape)
     return make_mask(values, (origin[0], origin[1], origin[2]), (spacing[0], spacing[1], spacing[2]))
+
+
+def _floats(numbers: Vector) -> Vector:
+    x, y, z = map(float, numbers)
+    return (x, y, z)
 
 
 def _whole(voxels: DoubleArray) -> IntArray:

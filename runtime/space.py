@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from solidgrain.runtime.arguments import Numbers
 from solidgrain.runtime.blend_file import BlendData, blend_of
 from solidgrain.runtime.bundle import ENCODER, MAPPING, Bundle, bundle_folder, open_again, open_bundle
 from solidgrain.runtime.errors import BundleError, ExemplarError
 from solidgrain.runtime.mask import Mask, Vector, make_mask, make_ramp
 from solidgrain.runtime.provider import open_session
-from solidgrain.runtime.texture import Numbers, Texture, make_workers, open_texture
+from solidgrain.runtime.texture import Texture, make_workers, open_texture
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.runtime.workers import Workers
 
@@ -44,7 +45,9 @@ def load_space(
     owner = open_bundle(bundle_folder(os.fspath(source)))
     if not owner.is_space:
         raise BundleError(f"{source}: holds one texture and no encoder; expected a space, made from solidgrain train --space")
-    return Space(owner, provider, precision, make_workers(threads))
+    space = Space(owner, provider, precision, make_workers(threads))
+    space.texture(np.zeros(owner.manifest["latent"]))  # what cannot be had is an error now, not with the first photograph
+    return space
 
 
 def _opened_again(sampler_sha256: str, folder: Path, provider: str, precision: str, threads: int) -> Space:
@@ -58,6 +61,11 @@ class Space:
     def __init__(self, bundle: Bundle, provider: str, precision: str, workers: Workers) -> None:
         self.bundle, self._provider, self._precision, self.workers = bundle, provider, precision, workers
         self._encoder = _graph(bundle, ENCODER, ["exemplar"], ["z"])
+        if self._encoder.get_inputs()[0].shape[1:] != [3, self.patch, self.patch]:
+            seen = self._encoder.get_inputs()[0].shape
+            raise BundleError(
+                f"{bundle.folder / ENCODER}: takes {seen}, the manifest says {self.patch}² pixels; export it again"
+            )
         self._mapping = _graph(bundle, MAPPING, ["z"], ["transforms", "gamma", "delta", "noise_weights"])
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, SupportsIndex
@@ -13,10 +13,21 @@ from typing import Any, SupportsIndex
 import numpy as np
 import numpy.typing as npt
 
+from solidgrain.runtime.arguments import (
+    FARTHEST,
+    Numbers,
+    Vector,
+    Whole,
+    parse_affine,
+    parse_extents,
+    parse_spacing,
+    parse_vector,
+    parse_whole,
+)
 from solidgrain.runtime.blend_engine import open_blend_engine
 from solidgrain.runtime.blend_file import FORMAT as BLEND_FORMAT
 from solidgrain.runtime.blend_file import BlendData, read_blend, write_blend
-from solidgrain.runtime.bundle import TEXTURE, Bundle, bundle_folder, find_bundle, open_again, open_bundle
+from solidgrain.runtime.bundle import TEXTURE, Bundle, bundle_folder, find_bundle, is_texture_file, open_again, open_bundle
 from solidgrain.runtime.engine import Engine, Instance, open_engine
 from solidgrain.runtime.errors import BundleError, EvaluationError, ProviderError
 from solidgrain.runtime.lattice import Tiling, tiled, untiled
@@ -25,15 +36,9 @@ from solidgrain.runtime.workers import Workers
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
-Vector = tuple[float, float, float]
-Numbers = Sequence[float] | npt.NDArray[np.number[Any]]
-Whole = Sequence[int] | npt.NDArray[np.integer[Any]]
 
 DEFAULT_TEXTURE = "granite"
 SLAB = 16  # slices per slab
-FINEST = 1e-9  # exemplar pixels: of a spacing or a transform
-FARTHEST = 2.0**36  # exemplar pixels: float64 coordinates still tell the places within a texel apart there
-LARGEST = 2**40  # voxels along an axis, threads, slices: what no machine has
 
 
 def load_texture(
@@ -76,7 +81,7 @@ def _opened_again(data: TextureData | BlendData, folder: Path, provider: str, pr
 
 
 def make_workers(threads: int) -> Workers:
-    (count,) = _whole("threads", (threads,), count=1, least=0)
+    (count,) = parse_whole("threads", (threads,), count=1, least=0)
     return Workers(count)
 
 
@@ -88,7 +93,7 @@ def check_alone(source: str, bundle: str | os.PathLike[str] | None) -> None:
 
 def _resolve(source: str, bundle: str | None) -> tuple[TextureData | BlendData, Bundle]:
     path = Path(source)
-    if path.is_file():
+    if is_texture_file(source):
         data = read_blend(path) if format_of(path) == BLEND_FORMAT else read_texture(path)
         folder = find_bundle(data.sampler_sha256, path.parent) if bundle is None else bundle_folder(bundle)
         if folder is None:
@@ -104,8 +109,8 @@ def _resolve(source: str, bundle: str | None) -> tuple[TextureData | BlendData, 
             f"{source}: is a space, which holds no texture of its own; "
             f"solidgrain encode PHOTO --bundle {source} --out PHOTO.sgt.npz makes one"
         )
-    if not (owner.folder / TEXTURE).is_file():
-        raise BundleError(f"{owner.folder / TEXTURE}: missing; this bundle holds no texture of its own")
+    if TEXTURE not in owner.manifest["files"]:
+        raise BundleError(f"{owner.folder / TEXTURE}: not in the manifest; this bundle holds no texture of its own")
     return read_texture(owner.folder / TEXTURE), owner
 
 
@@ -218,7 +223,7 @@ class Texture:
         """
         slabs = self.slabs(shape, seed, origin=origin, spacing=spacing, tile=tile, period=period, transform=transform)
         try:
-            volume = np.empty((*_positive("shape", shape), 3), np.float32)
+            volume = np.empty((*parse_extents("shape", shape), 3), np.float32)
         except (ValueError, MemoryError) as error:
             raise EvaluationError(f"shape {shape}: more than an array can hold here; take slabs() instead") from error
         for z, slab in slabs:
@@ -243,20 +248,27 @@ class Texture:
         `slices` (first, stop) are all of it, or the part that is wanted. Memory is bounded by the slab, whatever the
         depth. Other arguments and errors as in `grid`.
         """
-        depth, rows, columns = _positive("shape", shape)
-        (thickness,) = _whole("slab", (slab,), count=1, least=1)
-        low, high = (0, depth) if slices is None else _whole("slices", slices, count=2, least=0)
+        depth, rows, columns = parse_extents("shape", shape)
+        (thickness,) = parse_whole("slab", (slab,), count=1, least=1)
+        low, high = (0, depth) if slices is None else parse_whole("slices", slices, count=2, least=0)
         if not low <= high <= depth:
             raise EvaluationError(f"slices {slices}: expected first and stop, from 0 to {depth}")
         start = self.grid_start(shape, origin=origin, spacing=spacing, tile=tile, period=period, transform=transform)
-        step, tiling = _spacing(spacing), self.tiling(shape, spacing=spacing, tile=tile, period=period, transform=transform)
+        tiling = self.tiling(shape, spacing=spacing, tile=tile, period=period, transform=transform)
+        step = parse_spacing(spacing)
         instance = self._instance(tiling, seed)
-        x, y, z = (
-            tiling.wrap(start[axis] + (np.arange(count, dtype=np.float64) + 0.5) * step[axis], axis)
-            for axis, count in enumerate((columns, rows, depth))
+
+        def places(axis: int, first: int, stop: int) -> DoubleArray:
+            return tiling.wrap(start[axis] + (np.arange(first, stop, dtype=np.float64) + 0.5) * step[axis], axis)
+
+        try:
+            x, y = places(0, 0, columns), places(1, 0, rows)
+        except (ValueError, MemoryError) as error:
+            raise EvaluationError(f"shape {shape}: more than an array can hold here; take a part of it") from error
+        return (
+            (first, self._slab(instance, x, y, places(2, first, min(first + thickness, high))))
+            for first in range(low, high, thickness)
         )
-        z = z[:high]
-        return ((first, self._slab(instance, x, y, z[first : first + thickness])) for first in range(low, high, thickness))
 
     def grid_start(
         self,
@@ -272,8 +284,8 @@ class Texture:
 
         Evaluates nothing: it raises the EvaluationError that `grid` would, at no cost.
         """
-        depth, rows, columns = _positive("shape", shape)
-        matrix, corner, step = _affine(transform), _finite("origin", origin), _spacing(spacing)
+        depth, rows, columns = parse_extents("shape", shape)
+        matrix, corner, step = parse_affine(transform), parse_vector("origin", origin), parse_spacing(spacing)
         shift = np.linalg.solve(matrix[:3, :3], matrix[:3, 3]).tolist()
         start = (corner[0] + shift[0], corner[1] + shift[1], corner[2] + shift[2])
         ends = [start[axis] + step[axis] * count for axis, count in enumerate((columns, rows, depth))]
@@ -301,11 +313,11 @@ class Texture:
         transform: npt.ArrayLike | None = None,
     ) -> Tiling:
         """How tiling moves this texture's transforms for such a grid, and by how much (`distortion`)."""
-        voxels = _positive("period", shape if period is None else period)
+        voxels = parse_extents("period", shape if period is None else period)
         if not isinstance(tile, str):
             raise EvaluationError(f"tile {tile!r}: expected axes to repeat along, a text of x, y and z")
-        step = _spacing(spacing)
-        matrix = _affine(transform)[:3, :3]
+        step = parse_spacing(spacing)
+        matrix = parse_affine(transform)[:3, :3]
         transforms = self.transforms if transform is None else self.transforms @ matrix
         span = (voxels[2] * step[0], voxels[1] * step[1], voxels[0] * step[2])
         key = (transforms.tobytes(), matrix.tobytes(), span, tile)
@@ -332,54 +344,3 @@ class Texture:
         if last is None or last[0] != key:
             last = self._last = (key, self._engine.instance(tiling, number))
         return last[1]
-
-
-def _positive(name: str, values: Whole) -> tuple[int, ...]:
-    return _whole(name, values, count=3, least=1)
-
-
-def _whole(name: str, values: Whole, count: int, least: int) -> tuple[int, ...]:
-    try:
-        numbers = tuple(operator.index(value) for value in values)
-    except TypeError:
-        numbers = ()
-    if len(numbers) != count or min(numbers) < least or max(numbers) > LARGEST:
-        plural = "s" * (count > 1)
-        found = values[0] if count == 1 else values
-        raise EvaluationError(f"{name} {found}: expected {count} whole number{plural} from {least} to {LARGEST}")
-    return numbers
-
-
-def _finite(name: str, values: Numbers) -> Vector:
-    try:
-        numbers = tuple(float(value) for value in values)
-    except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) != 3 or not np.isfinite(numbers).all():
-        raise EvaluationError(f"{name} {values}: expected three finite numbers (x, y, z)")
-    return (numbers[0], numbers[1], numbers[2])
-
-
-def _affine(transform: npt.ArrayLike | None) -> DoubleArray:
-    """A placement [4, 4] in float64, the identity for None."""
-    try:
-        matrix = np.eye(4) if transform is None else np.array(transform, np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
-        raise EvaluationError("transform: expected 4x4 finite numbers with the last row 0, 0, 0, 1")
-    scales = np.linalg.svd(matrix[:3, :3], compute_uv=False)
-    if scales[2] <= max(FINEST, 1e-9 * scales[0]) or scales[0] > FARTHEST:
-        raise EvaluationError("transform: its 3x3 part has no inverse or extreme scales, expected one that keeps space solid")
-    return matrix
-
-
-def _spacing(spacing: float | Numbers) -> Vector:
-    try:
-        alone = np.ndim(spacing) == 0
-    except ValueError:  # neither a number nor three
-        alone = False
-    step = _finite("spacing", (spacing,) * 3 if alone else spacing)  # type: ignore[arg-type]
-    if min(step) < FINEST or max(step) > FARTHEST:
-        raise EvaluationError(f"spacing {step}: expected {FINEST:g} to {FARTHEST:g} exemplar pixels per voxel")
-    return step

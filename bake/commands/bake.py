@@ -46,11 +46,11 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(report, indent=2) if arguments.json else summary(report))
         return 0
     try:
-        encoded.save()
-        if not plan.outputs:
-            report = result(plan, texture, Baked([], 0.0))
+        encoded.save([plan])
+        if arguments.emit_openjd and (plan.outputs or arguments.update):
+            report = emit_job(asked if arguments.update else plan, arguments)  # its shards leave out what is whole
         else:
-            report = emit_job(plan, arguments) if arguments.emit_openjd else bake_plan(plan, texture, arguments)
+            report = bake_plan(plan, texture, arguments) if plan.outputs else result(plan, texture, Baked([], 0.0))
     except BaseException:
         encoded.remove_unused([plan])
         raise
@@ -96,7 +96,7 @@ def planned(arguments: argparse.Namespace, encoded: Encoded) -> tuple[Plan, Text
 
 def run_jobs(arguments: argparse.Namespace) -> int:
     """Bake, or plan, every job of a job file. Exit code 1 if one failed."""
-    from solidgrain.bake.jobs import FAILED, bake_jobs, plan_jobs, read_jobs
+    from solidgrain.bake.jobs import FAILED, bake_jobs, in_turn, plan_jobs, read_jobs
     from solidgrain.bake.report import describe, summary
 
     encoded = Encoded(tell)
@@ -104,11 +104,11 @@ def run_jobs(arguments: argparse.Namespace) -> int:
     jobs, textures = plan_jobs(read, encoded.settle, lambda named: encoded.load(named) or load_texture(named), to_do)
     if arguments.dry_run:
         encoded.tell_missing()
-        plans = [{"name": one.job.name, **describe(one.plan, textures[one.job.texture])} for one in jobs]
+        plans = [{"name": one.job.name, **describe(one.plan, texture)} for one, texture in in_turn(jobs, textures)]
         print(json.dumps({"jobs": plans}, indent=2) if arguments.json else "\n\n".join(map(summary, plans)))
         return 0
     try:
-        encoded.save()
+        encoded.save(one.plan for one in jobs)
         report = bake_jobs(jobs, textures, bake_plan, tell_error, arguments.continue_on_error)
     finally:
         encoded.remove_unused(one.plan for one in jobs)
@@ -168,6 +168,8 @@ def bake_plan(plan: Plan, texture: Texture, arguments: argparse.Namespace) -> di
     from solidgrain.bake.distributed import bake_on_cluster
     from solidgrain.bake.report import Progress, result
 
+    if texture.provider_note and not arguments.quiet:
+        tell(f"{plan.texture}: evaluated by {texture.provider}, no fused kernel: {texture.provider_note}")
     progress = Progress(arguments.quiet)
     shard, details = asked_shard(plan, arguments), {}
     try:

@@ -10,6 +10,8 @@ import platform
 from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from typing import Any
 
+from solidgrain.bake.messages import first_line
+
 PACKAGES = (
     *("solidgrain", "numpy", "onnxruntime", "OpenEXR", "OpenImageIO", "isal", "jsonschema", "etcpak", "distributed"),
     *("pyvista", "vtk", "torch", "onnx", "spox"),
@@ -86,7 +88,7 @@ def _providers(problems: list[str]) -> dict[str, str]:
         except SolidgrainError as error:
             found[provider] = str(error)
         except Exception as error:  # a provider's own failure, whatever its type, is what is being reported
-            found[provider] = str(error).strip().splitlines()[0]
+            found[provider] = first_line(error)
     if found.get("cpu") != "works":
         problems.append(f"the CPU provider does not work: {found.get('cpu', 'not offered')}")
     return found

@@ -15,6 +15,7 @@ from solidgrain.bake.writers.table import (
     output_files,
     scratch_bytes,
     suffixes,
+    turned_bytes,
 )
 
 __all__ = [
@@ -36,4 +37,5 @@ __all__ = [
     "output_files",
     "scratch_bytes",
     "suffixes",
+    "turned_bytes",
 ]

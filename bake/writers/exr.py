@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.bake.color import LINEAR, LUMA, SRGB, as_floats, to_linear
+from solidgrain.bake.color import LINEAR, SRGB, as_floats, luma, to_linear
 from solidgrain.bake.frames import PATTERN, frame_paths
 from solidgrain.bake.store import Encoded, Finished, Store
 from solidgrain.bake.writers.base import ROUNDING, FloatArray, Option, Output, Volume, Writer
@@ -66,7 +66,7 @@ class ExrStack(Writer):
         dtype, rgb = TYPES[str(self.output.options["type"])], self.colors(srgb)
         if list(self.channels.items()) == [("R", "r"), ("G", "g"), ("B", "b")]:
             return {"RGB": as_floats(rgb, dtype)}
-        values = {"luma": to_linear(srgb) @ LUMA, "one": np.ones(rgb.shape[:2], np.float32)}
+        values = {"luma": luma(to_linear(srgb)), "one": np.ones(rgb.shape[:2], np.float32)}
         values |= {source: rgb[..., k] for k, source in enumerate("rgb")}
         return {name: as_floats(values[source], dtype) for name, source in self.channels.items()}
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from solidgrain.bake.color import HALF_LARGEST, LINEAR, SRGB, color_options
 from solidgrain.bake.writers.base import Option, Output, Volume, Writer
 from solidgrain.bake.writers.mips import FILTERS, MippedWriter, level_output, level_volumes
-from solidgrain.bake.writers.orient import SPOOL_BYTES, UPRIGHT, OrientedWriter, oriented
+from solidgrain.bake.writers.orient import SPOOL_BYTES, UPRIGHT, OrientedWriter, oriented, slab_bytes
 from solidgrain.runtime.errors import UsageError
 from solidgrain.runtime.workers import Workers
 
@@ -105,7 +105,8 @@ def make_output(path: Path, kind: str = "", /, **options: str | int) -> Output:
     _check_axes(path, str(options.get("axes", UPRIGHT)))
     if options.get("mips", "") not in ("", *FILTERS):
         raise UsageError(f"{path}: mips {options['mips']!r}, expected one of {', '.join(FILTERS)}")
-    filled = known | {name: value for name, value in options.items() if value != ""}
+    own = {option.name for option in row.options}
+    filled = known | {name: value for name, value in options.items() if value != "" or name in own}
     output = Output(path, kind, filled | color_options(str(filled["colorspace"]), str(filled["colorconfig"])))
     return output if rounds(output) else replace(output, options={**output.options, "dither": 0})
 
@@ -163,9 +164,18 @@ def output_bytes(output: Output, volume: Volume) -> int:
 
 def scratch_bytes(output: Output, volume: Volume) -> int:
     """The bytes that a bake keeps beside an output until it is whole, besides its files."""
-    per_voxel = formats()[output.kind].scratch(output) + (SPOOL_BYTES if axes_of(output) != UPRIGHT else 0)
-    reduced = 12 * volume.voxels * 2 // 7 if output.options["mips"] else 0  # a quarter, an eighth of that, ...
-    return volume.voxels * per_voxel + reduced
+    row, spooled = formats()[output.kind], SPOOL_BYTES * volume.voxels if axes_of(output) != UPRIGHT else 0
+    if not output.options["mips"]:
+        return spooled + row.scratch(output) * volume.voxels
+    reduced = 12 * volume.voxels * 2 // 7  # a quarter, an eighth of that, ...
+    below = level_volumes(_levels(output, volume)[0][1])
+    staged = sum(row.size(output, level) for level in below) if row.levels_inside else 0  # and in the file itself
+    return spooled + reduced + staged + row.scratch(output) * (volume.voxels + sum(level.voxels for level in below))
+
+
+def turned_bytes(output: Output, volume: Volume) -> int:
+    """The colours, as float32, that a turned output is put together from at a time; 0 for one that is not turned."""
+    return 0 if axes_of(output) == UPRIGHT else slab_bytes(oriented(volume, axes_of(output)))
 
 
 def check_output(output: Output, volume: Volume) -> None:

@@ -8,11 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from solidgrain.bake import checks, report
 from solidgrain.export.bundle import Details, write_bundle
 from tests.toy import toy_weights
 
@@ -229,3 +231,41 @@ def test_help_lists_the_commands_and_no_command_is_a_usage_error(solidgrain):
     assert "bake" in solidgrain("--help").out
     assert solidgrain().code == 2
     assert solidgrain("frobnicate").code == 2
+
+
+def test_a_control_group_bounds_the_memory_that_is_available(tmp_path):
+    """A container of 1000 bytes in a job of 400."""
+    (tmp_path / "own").write_text("1:name=systemd:/x\n0::/job/container\n")
+    for folder, limit, used in (("job/container", "1000", 500), ("job", "400", 300), ("", "max", 10**6)):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+        (tmp_path / folder / "memory.max").write_text(f"{limit}\n")
+        (tmp_path / folder / "memory.current").write_text(f"{used}\n")
+    (tmp_path / "job" / "memory.stat").write_text("anon 7\ninactive_file 20\n")
+    assert sorted(checks._left_by_groups(tmp_path, tmp_path / "own")) == [120, 500]
+    assert checks._left_by_groups(tmp_path, tmp_path / "none") == []
+    assert checks.available_memory() > 0
+
+
+def test_time_left_is_told_once_something_is_done(monkeypatch, capsys):
+    """The first call says what was there from the start."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    clock = iter([0.0, 0.0, 1.0, 2.0])
+    monkeypatch.setattr(report, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    progress = report.Progress(quiet=False)
+    for done in (64, 80, 96):
+        progress.show(done, 256)
+    shown = capsys.readouterr().err.split("\r")[1:]
+    assert [line.split("] ")[1] for line in shown] == ["slice 64/256 ", "slice 80/256, 11 s left ", "slice 96/256, 10 s left "]
+
+
+def test_a_bake_without_the_fused_kernel_says_why(solidgrain, tmp_path, toy_folder, monkeypatch):
+    monkeypatch.setenv("SOLIDGRAIN_KERNEL_LIBRARY", "/nonexistent")
+    outcome = solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy", "--json")
+    assert json.loads(outcome.out)["provider_note"]
+    assert "toy: evaluated by CPUExecutionProvider, no fused kernel: " in outcome.err
+
+
+def test_an_empty_name_is_not_taken_for_the_default(solidgrain, tmp_path, toy_folder):
+    outcome = solidgrain("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.vdb", "--vdb-grid", "")
+    assert outcome.code == 2
+    assert list(tmp_path.iterdir()) == []

@@ -13,8 +13,11 @@ import OpenImageIO as oiio
 import pytest
 
 from solidgrain.bake import opengl
+from solidgrain.bake.masks import read_mask
+from solidgrain.bake.messages import first_line
 from solidgrain.bake.view import read_volume
 from solidgrain.runtime.bundle import embedded_folder
+from solidgrain.runtime.errors import BakeError
 
 
 @pytest.fixture(scope="module")
@@ -165,6 +168,20 @@ def test_a_file_that_is_no_volume_is_refused(solidgrain, tmp_path, name, content
 def test_an_array_that_is_no_volume_is_refused(solidgrain, tmp_path, array):
     np.save(tmp_path / "odd.npy", array)
     assert "odd.npy" in solidgrain("view", tmp_path / "odd.npy", "--screenshot", tmp_path / "view.png").error
+
+
+def test_an_archive_that_is_called_an_array_is_refused(solidgrain, tmp_path):
+    with open(tmp_path / "archive.npy", "wb") as file:
+        np.savez(file, np.zeros((2, 2, 2, 3)))
+    outcome = solidgrain("view", tmp_path / "archive.npy", "--screenshot", tmp_path / "view.png")
+    assert (outcome.code, outcome.error.endswith("archive.npy: not readable as a NumPy array")) == (1, True)
+    with pytest.raises(BakeError, match=r"archive\.npy: not readable as a NumPy array"):
+        read_mask(tmp_path / "archive.npy")
+
+
+def test_a_library_s_error_without_words_is_called_by_its_type():
+    assert first_line(MemoryError()) == "MemoryError"
+    assert first_line(ValueError("one\ntwo")) == "one"
 
 
 def test_a_closed_pipe_is_no_traceback():

@@ -81,6 +81,13 @@ def test_a_photograph_bakes_as_the_texture_that_is_saved_beside_it(solidgrain, t
     assert solidgrain("bake", photograph, *flags, "--resume").code == 0
 
 
+def test_no_texture_is_saved_for_files_that_stay(solidgrain, toy_space_folder, photograph, tmp_path):
+    (tmp_path / "cliff.npy").touch()
+    flags = ("--bundle", toy_space_folder, "--size", "8", "--out", tmp_path / "cliff.npy")
+    assert solidgrain("bake", photograph, *flags, "--no-clobber").code == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["cliff.npy"]
+
+
 def test_a_dry_run_of_a_photograph_writes_nothing(solidgrain, toy_space_folder, photograph, tmp_path):
     flags = ("bake", photograph, "--bundle", toy_space_folder, "--size", 4, "--out", tmp_path / "a.vti")
     outcome = solidgrain(*flags, "--dry-run", "--json")

@@ -101,6 +101,13 @@ def test_an_emitted_job_is_kept_unless_told_otherwise(solidgrain, toy_folder, tm
     assert merge["script"]["actions"]["onRun"]["args"] == ["merge", "{{Param.Plan}}", "--threads", "2", "--overwrite"]
 
 
+def test_an_update_of_what_is_whole_is_emitted_all_the_same(solidgrain, toy_folder, tmp_path):
+    flags = ("bake", toy_folder, "--size", 4, "--out", tmp_path / "a.npy", "--update")
+    assert solidgrain(*flags).code == 0
+    assert solidgrain(*flags, "--emit-openjd", tmp_path / "job").code == 0
+    assert len(load_plan(tmp_path / "job" / "plan.json").outputs) == 1
+
+
 def test_what_a_bake_would_refuse_is_not_emitted(solidgrain, toy_folder, tmp_path):
     for output, folder, message in (
         ("missing/a.npy", "job", "does not exist"),

@@ -10,7 +10,7 @@ import OpenEXR
 import pytest
 
 from solidgrain.bake.baker import bake
-from solidgrain.bake.color import to_linear
+from solidgrain.bake.color import luma, to_linear
 from solidgrain.bake.writers import make_output
 from solidgrain.bake.writers.orient import oriented
 from tests.bake.test_writers import ORIGIN, SIZE, SPACING, plan_for
@@ -57,3 +57,14 @@ def test_the_turned_volume_keeps_its_place_in_space(toy):
     assert turned.origin == (ORIGIN[2], -(ORIGIN[1] + SIZE[1] * SPACING[1]), ORIGIN[0])
     assert turned.spacing == SPACING[::-1]
     assert turned.tile == "xy"
+
+
+def test_the_estimate_of_memory_knows_slices_that_lie_along_the_depth(tmp_path, toy):
+    output = make_output(tmp_path / "a.####.exr", axis="y")
+    deep = plan_for(toy, output, size=(256, 256, 65536))
+    assert deep.memory > plan_for(toy, make_output(tmp_path / "a.####.exr"), size=(256, 256, 65536)).memory + 2**29
+
+
+def test_luma_does_not_depend_on_where_a_slice_begins():
+    linear = np.random.default_rng(3).random((5, 37, 3), dtype=np.float32)
+    np.testing.assert_array_equal(luma(linear)[:, 3:], luma(linear[:, 3:]))

@@ -244,6 +244,25 @@ def test_a_turned_tile_is_held_against_the_axis_that_it_repeats_along(ramp):
         ramp.grid_start((1, 64, 64), tile="y", transform=quarter)
 
 
+def test_whole_numbers_and_floats_make_the_same_blend(space, ends):
+    places = ((0, 96), (0.0, 96.0), (np.float32(0), np.float64(96)))
+    assert len({space.blend_along(*ends, "z", *place).data.sha256 for place in places}) == 1
+
+
+@pytest.mark.parametrize("asked", [{"provider": "nonsense"}, {"provider": "cuda"}, {"precision": "float8"}])
+def test_a_space_that_cannot_be_evaluated_as_asked_is_not_loaded(toy_space_folder, asked):
+    with pytest.raises(ProviderError):
+        load_space(toy_space_folder, **asked)
+
+
+def test_a_manifest_that_says_another_patch_than_the_encoder_takes_is_refused(toy_space_folder, tmp_path):
+    folder = shutil.copytree(toy_space_folder, tmp_path / "space")
+    manifest = json.loads((folder / MANIFEST).read_text())
+    (folder / MANIFEST).write_text(json.dumps(manifest | {"encoded_patch": 3}))
+    with pytest.raises(BundleError, match=r"encoder\.onnx: takes .*, the manifest says 3² pixels"):
+        load_space(folder)
+
+
 def test_a_saved_blend_is_the_same_elsewhere(ramp, toy_space_folder, tmp_path):
     for name in ("one.sgt.npz", "two.sgt.npz"):
         ramp.save(tmp_path / name)

@@ -144,6 +144,31 @@ def test_another_format_or_version_is_refused(broken, changes, message):
         load(broken)
 
 
+def test_colours_that_are_not_srgb_are_not_taken_for_it(broken):
+    edit_manifest(broken, color_encoding="lin_ap1_scene")
+    with pytest.raises(BundleError, match="colours are 'lin_ap1_scene', this solidgrain reads 'srgb_rec709_scene'"):
+        load(broken)
+
+
+def test_a_texture_that_the_manifest_does_not_vouch_for_is_not_loaded(broken):
+    edit_manifest(broken, files={"sampler.onnx": file_sha256(broken / "sampler.onnx")})
+    with pytest.raises(BundleError, match=r"texture\.sgt\.npz: not in the manifest"):
+        load(broken)
+
+
+def test_a_file_called_as_an_embedded_texture_does_not_hide_it(tmp_path, monkeypatch):
+    (tmp_path / "granite").write_text("notes on granite")
+    monkeypatch.chdir(tmp_path)
+    assert load().name == load("granite").name == "granite"
+    with pytest.raises(BundleError, match="not a texture file"):
+        load("./granite")
+
+
+def test_a_name_that_is_too_long_for_a_file_is_an_unknown_one():
+    with pytest.raises(BundleError, match="no such texture"):
+        load("a" * 5000)
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 1}'])
 def test_a_manifest_that_is_no_manifest_is_refused(broken, text):
     (broken / "manifest.json").write_text(text)

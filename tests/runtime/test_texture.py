@@ -243,3 +243,12 @@ def test_a_copy_in_this_process_or_another_is_the_same_texture(toy, copied):
     again = copied(toy)
     np.testing.assert_array_equal(again.sample(points, 7), toy.sample(points, 7))
     assert (again.provider, again.precision, again.threads, again.name) == (toy.provider, toy.precision, toy.threads, toy.name)
+
+
+def test_a_column_of_any_depth_costs_no_more_than_its_slabs(toy):
+    column = toy.slabs((2**39, 1, 1), spacing=0.01)
+    z, slab = next(column)
+    assert (z, slab.shape) == (0, (16, 1, 1, 3))
+    np.testing.assert_array_equal(slab, toy.grid((16, 1, 1), spacing=0.01))
+    with pytest.raises(EvaluationError, match="more than an array can hold here"):
+        toy.slabs((1, 1, 2**40), spacing=0.01)
