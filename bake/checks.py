@@ -29,7 +29,7 @@ def check_plan(plan: Plan, overwrite: bool, begun: Sequence[Output] = (), shard:
         check_folder(output.path)
         _check_text(output)
     _check_memory(plan)  # before any list as long as the volume is made
-    _check_disk(plan, shard)
+    check_disk([plan], shard)
     taken: set[Path] = set()
     for output in plan.outputs:
         for path in output_files(output, plan.volume):
@@ -118,22 +118,23 @@ def _check_memory(plan: Plan) -> None:
         )
 
 
-def _check_disk(plan: Plan, shard: tuple[int, int] | None) -> None:
+def check_disk(plans: Sequence[Plan], shard: tuple[int, int] | None = None) -> None:
     """The outputs' sizes per file system against its free space, less what an earlier bake has left there."""
-    share = 1.0 if shard is None else (shard[1] - shard[0]) / plan.size[2]
     needed: dict[int, tuple[Path, int]] = {}
-    for output in plan.outputs:
-        folder = output.path.parent
-        device = folder.stat().st_dev
-        size = int(share * (output_bytes(output, plan.volume) + scratch_bytes(output, plan.volume)))
-        size -= staged_bytes(output.path) if shard is None else 0
-        needed[device] = (folder, needed.get(device, (folder, 0))[1] + max(0, size))
+    for plan in plans:
+        share = 1.0 if shard is None else (shard[1] - shard[0]) / plan.size[2]
+        for output in plan.outputs:
+            folder = output.path.parent
+            device = folder.stat().st_dev
+            size = int(share * (output_bytes(output, plan.volume) + scratch_bytes(output, plan.volume)))
+            size -= staged_bytes(output.path) if shard is None else 0
+            needed[device] = (folder, needed.get(device, (folder, 0))[1] + max(0, size))
     for folder, size in needed.values():
         free = shutil.disk_usage(folder).free
         if size > free:
+            who = f"--size {format_size(plans[0].size)}: the bake needs" if len(plans) == 1 else f"all {len(plans)} jobs need"
             raise BakeError(
-                f"--size {format_size(plan.size)}: the bake needs up to {format_bytes(size)} in {folder.resolve()}, "
-                f"{format_bytes(free)} are free; bake less or elsewhere"
+                f"{who} up to {format_bytes(size)} in {folder.resolve()}, {format_bytes(free)} are free; bake less or elsewhere"
             )
 
 

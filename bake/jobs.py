@@ -189,6 +189,7 @@ def plan_jobs(
 
     `settle` turns photographs among the sources into texture files.
     """
+    from solidgrain.bake.checks import check_disk
     from solidgrain.bake.flags import make_plan
 
     textures: dict[object, Texture] = {}
@@ -205,6 +206,7 @@ def plan_jobs(
     for one in planned:
         with _named(one.job.where):
             checked.append(replace(one, plan=to_do(one.plan, one.job.arguments)))
+    check_disk([one.plan for one in checked])
     _check_names(planned)  # last: the list of a volume's files is bounded by its memory, which is checked now
     return checked, textures
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -400,3 +401,12 @@ def test_a_dry_run_tells_of_every_job_and_writes_nothing(solidgrain, write_jobs)
     assert [(job["name"], job["plan"]["seed"]) for job in report] == [("a", 0), ("b", 9)]
     assert solidgrain("bake", "--jobs", path, "--dry-run").out.count("memory") == 2
     assert [file.name for file in path.parent.iterdir()] == ["jobs.json"]
+
+
+def test_all_jobs_together_must_fit_on_the_disk(solidgrain, write_jobs, monkeypatch):
+    """Each fits, two do not."""
+    first, second = ({"name": name, "size": 16, "out": f"{name}.npy"} for name in "ab")
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=80_000))
+    outcome = solidgrain("bake", "--jobs", write_jobs(first, second))
+    assert (outcome.code, "all 2 jobs need up to" in outcome.error) == (1, True)
+    assert solidgrain("bake", "--jobs", write_jobs(first)).code == 0
