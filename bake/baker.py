@@ -28,7 +28,7 @@ from solidgrain.runtime.workers import Workers
 
 AHEAD = 2  # slabs that wait for the disk, at most, while the next is evaluated
 
-OnSlice = Callable[[int, int], None]  # slices done, slices in all
+OnSlice = Callable[[int, int], None]  # slices done, slices in all; the first call says what was there
 Notes = list[dict[str, Any]]  # of complete files: see `Staging.finish`
 Shard = tuple[int, int]  # slices first .. stop - 1
 
