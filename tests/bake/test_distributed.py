@@ -229,7 +229,7 @@ def test_an_interrupted_bake_goes_on_to_the_same_bytes(cluster, toy, toy_folder,
     (tmp_path / "plan.json").write_text(json.dumps(plan.to_json()))
     command = [sys.executable, "-m", "solidgrain.bake.cli", "bake", "--plan", "plan.json", "--dask", "local:2", "--shards", "2"]
     process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not any(path.stat().st_size for path in tmp_path.glob(".a.vti.baking/journal.*")) and time.monotonic() < deadline:
         time.sleep(0.001)
     os.killpg(process.pid, signal.SIGINT)

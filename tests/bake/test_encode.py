@@ -193,7 +193,7 @@ def test_jobs_of_one_photograph_have_their_own_precision_and_one_space(toy_space
     assert textures[0] is not textures[1]
     kept = weakref.ref(textures[0])
     del textures
-    encoded.save()
+    encoded.save([Namespace(source=str(tmp_path / "cliff.sgt.npz"), outputs=("a.npy",))])
     gc.collect()
     assert kept() is None  # the jobs alone hold on to what they bake
     assert read_texture(tmp_path / "cliff.sgt.npz").name == "cliff"
