@@ -125,12 +125,11 @@ def start_space(arguments: argparse.Namespace) -> RunFolder:
     if arguments.anisotropic:
         settings = replace(settings, grain=arguments.anisotropic)
 
-    held_out = held_out_names(arguments.hold_out)
-    choose_held_out([path.name for path in photographs_in(arguments.space)], held_out, settings.seed)  # before all are read
     smallest = max(settings.patch, settings.encoded_patch)
     members = read_members(arguments.space, smallest, bool(arguments.skip_unreadable), warn)
     source = Source("", arguments.license or "", arguments.credit or "")
-    budget = make_budget(arguments, settings)
+    budget, held_out = make_budget(arguments, settings), held_out_names(arguments.hold_out)
+    choose_held_out([path.name for path in photographs_in(arguments.space)], held_out, settings.seed)  # before all are read
     return create_space_run(arguments.out, settings, members, held_out, source, budget)
 
 

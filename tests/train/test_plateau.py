@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from solidgrain.train import loop, plateau
+from solidgrain.train import loop, plateau, task
 from solidgrain.train.loop import Trainer, train
 from solidgrain.train.plateau import EVERY, LEAST, Onlooker, Plateau
 from solidgrain.train.run import open_run
@@ -83,7 +83,7 @@ def told(monkeypatch):
             looks.append(average)
             return {1: 0.5, 2: 0.4}.get(len(looks), 0.45)
 
-    monkeypatch.setattr(loop, "Onlooker", Told)
+    monkeypatch.setattr(task, "Onlooker", Told)
     monkeypatch.setattr(loop, "EVERY", 2)
     monkeypatch.setattr(plateau, "LEAST", 6)
     monkeypatch.setattr(loop, "_write_sample", lambda trainer: None)

@@ -221,11 +221,11 @@ def test_held_out_photographs_that_the_warm_start_has_seen_are_named(solidgrain,
 
 
 def test_a_held_out_photograph_that_a_single_exemplar_s_run_was_of_is_named(solidgrain, tmp_path, small_presets):
-    folder, small = photographs(tmp_path / "stones", 3), ["--iterations", 1, "--threads", 1]
+    folder = photographs(tmp_path / "stones", 3)
     (tmp_path / "unseen.txt").write_text("stone1.png\n")
-    assert solidgrain("train", folder / "stone1.png", "--out", tmp_path / "single", *small, "--patch", 32).code == 0
-    flags = ["--hold-out", tmp_path / "unseen.txt", "--warm-start", tmp_path / "single"]
-    outcome = solidgrain("train", "--space", folder, "--out", tmp_path / "run", *flags, *small)
+    train(new_run(tmp_path / "single", folder / "stone1.png", width=TINY_SPACE["width"]), Budget(iterations=1), CPU)
+    flags = [*SMALL, "--hold-out", tmp_path / "unseen.txt", "--warm-start", tmp_path / "single"]
+    outcome = solidgrain("train", "--space", folder, "--out", tmp_path / "run", *flags, "--iterations", 1)
     assert f"1 held-out photographs were trained on by {tmp_path / 'single'}: stone1.png" in outcome.err
 
 
