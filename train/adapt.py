@@ -198,9 +198,8 @@ class Adaptation:
         settings = self.settings
         points = draw_slices(settings, generator)
         eta = look_up(noise.moved(generator), theta.directions * self.octave_scale, points)
-        with autocast(
-            self.generator.device, self.reduced_precision
-        ):  # coordinates stay outside it: in bfloat16 they are wrong by texels
+        # coordinates stay outside it: in bfloat16 they are wrong by texels
+        with autocast(self.generator.device, self.reduced_precision):
             rgb = self.sampler(eta, theta)
             activations = self.features.activations(self.stretch(as_images(rgb.float(), settings.patch)))
         pairs = zip(self.target, activations, strict=True)

@@ -124,9 +124,8 @@ class Trainer:
 
     def colors_at(self, inputs: Inputs) -> Tensor:
         """The model's colours [B, P, 3]."""
-        with autocast(
-            self.device, self.reduced_precision
-        ):  # the points are made outside it: in bfloat16 they are off by a tenth of a pixel
+        # the points are made outside it: in bfloat16 they are off by a tenth of a pixel
+        with autocast(self.device, self.reduced_precision):
             rgb: Tensor = self.sampler(*inputs)
         return rgb.float()
 
