@@ -24,7 +24,7 @@ from solidgrain.runtime.errors import BundleError, ExemplarError, TrainingError
 from solidgrain.runtime.fold import read_weights
 from solidgrain.runtime.texture_file import TextureData
 from solidgrain.train.average import follow
-from solidgrain.train.collection import LEVELS, Member, draw_patches, wraps
+from solidgrain.train.collection import Member, draw_patches, in_levels, wraps
 from solidgrain.train.companion import Companion
 from solidgrain.train.contrast import stretch_to
 from solidgrain.train.layers import activate
@@ -209,7 +209,7 @@ class Adaptation:
     @torch.no_grad()
     def _mean_grams(self, photograph: FloatArray) -> list[Tensor]:
         """What L_style compares with: since F is fixed, crops of the photograph need to be looked at only once."""
-        member = Member("", np.round(photograph * LEVELS).astype(np.uint16), wraps(photograph))
+        member = Member("", in_levels(photograph), wraps(photograph))
         height, width = photograph.shape[:2]
         if min(height, width) < self.settings.patch:
             raise ExemplarError(

@@ -67,8 +67,12 @@ def read_members(folder: Path, smallest: int, skip: bool, on_warning: Callable[[
             continue
         if photograph.warning:
             on_warning(f"{path}: {photograph.warning}")
-        pixels = np.round(photograph.pixels * LEVELS).astype(np.uint16)
-        yield Member(path.name, pixels, wraps(photograph.pixels), photograph.colorspace)
+        yield Member(path.name, in_levels(photograph.pixels), wraps(photograph.pixels), photograph.colorspace)
+
+
+def in_levels(exemplar: FloatArray) -> npt.NDArray[np.uint16]:
+    """An exemplar [H, W, 3] in [0, 1] as members hold it, and as their hashes are of it."""
+    return np.round(exemplar * LEVELS).astype(np.uint16)
 
 
 def photographs_in(folder: Path) -> list[Path]:

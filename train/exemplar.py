@@ -15,6 +15,7 @@ FloatArray = npt.NDArray[np.float32]
 
 CORRELATED = 2048  # pixels along each side, of which the autocorrelation is taken
 NONSTATIONARY = 0.3  # above it, one texture cannot describe the image (docs/training.md)
+INWARDS = 10  # steps that an edge's own is held against
 FRAMED = 3.0  # `edge_step` above which an image has a frame: photographs of stones without one come to 2.5 at most
 
 
@@ -49,7 +50,7 @@ def nonstationarity(exemplar: FloatArray) -> float:
     return float(blocks.mean((1, 3)).std() / max(float(grey.std()), 1e-6))
 
 
-def edge_step(exemplar: FloatArray, inwards: int = 10) -> float:
+def edge_step(exemplar: FloatArray) -> float:
     """The largest step between neighbouring rows or columns near an edge, over the largest of the steps that follow inwards.
 
     Frames, and the rims that resizing leaves, have a step that nothing beside it comes near.
@@ -59,7 +60,7 @@ def edge_step(exemplar: FloatArray, inwards: int = 10) -> float:
         steps = np.abs(np.diff(exemplar, axis=axis)).mean((1 - axis, 2))
         near = exemplar.shape[axis] // 32 + 1
         for ordered in (steps, steps[::-1]):
-            following = np.lib.stride_tricks.sliding_window_view(ordered[1:], inwards).max(1)[:near]
+            following = np.lib.stride_tricks.sliding_window_view(ordered[1:], INWARDS).max(1)[:near]
             largest = max(largest, float((ordered[:near] / np.maximum(following, 1e-3)).max()))
     return largest
 

@@ -6,10 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from solidgrain.runtime.bundle import embedded_folder, open_bundle
-from solidgrain.train.collection import LEVELS
+from solidgrain.train.collection import in_levels
 from solidgrain.train.exemplar import FRAMED, NONSTATIONARY, FloatArray, edge_step, nonstationarity
 from solidgrain.train.run import Run, pixels_sha256
 from solidgrain.train.space_run import SpaceRun, open_any
@@ -94,7 +92,7 @@ def seen_by(start: Path) -> tuple[set[str], bool]:
     if isinstance(other, SpaceRun):
         seen |= {pixels_sha256(member.pixels) for member in other.trained_on}
     elif isinstance(other, Run):
-        seen.add(pixels_sha256(np.round(other.exemplar * LEVELS).astype(np.uint16)))
+        seen.add(pixels_sha256(in_levels(other.exemplar)))
     return seen, not other.settings.warm_start
 
 
