@@ -179,6 +179,14 @@ def asked_options(arguments: argparse.Namespace, kind: str) -> dict[str, str | i
     return {**_shared_options(arguments, kind), **given}
 
 
+def check_dither(arguments: argparse.Namespace, outputs: Sequence[Output]) -> None:
+    """Refuse `--dither` where no output's type rounds. Raises UsageError."""
+    from solidgrain.bake.writers import rounds
+
+    if arguments.dither and outputs and not any(map(rounds, outputs)):
+        raise UsageError("--dither: no --out of whole numbers, of the types asked for; leave it out")
+
+
 def unused(paths: Sequence[Path]) -> dict[str, str]:
     """The flags that none of these outputs has a use for, each with the reason."""
     from solidgrain.bake.writers import formats, kind_of, may_round

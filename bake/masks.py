@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from solidgrain.bake.messages import first_line
+from solidgrain.runtime.arguments import Vector
 from solidgrain.runtime.errors import BakeError, UsageError
 from solidgrain.runtime.files import DAMAGED_ARRAY, map_array
-
-Vector = tuple[float, float, float]
 
 
 class MaskFile(NamedTuple):

@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from solidgrain.bake.frames import in_hashes
-from solidgrain.bake.writers import Output, Volume, turned_bytes
+from solidgrain.bake.writers import Output, Volume, slab_slices, turned_bytes
 from solidgrain.runtime.bundle import MANIFEST
 
-SLAB_BYTES = 48 * 2**20  # of float32 colour; what a bake holds at a time is a small multiple of it
-THICKEST_SLAB = 16  # slices
 IN_FLIGHT = 3  # slabs: one is evaluated while two wait for the disk (baker.AHEAD)
 ENCODING = 4  # slabs' worth that a writer holds at most, with a thread for each slice: half-float EXR needs 3.6
 DITHERING = 9  # the same where noise is made, from hashes of 64 bits: 8
@@ -67,9 +65,9 @@ class Plan:
 
     @property
     def slab(self) -> int:
-        """Slices per slab: as many as fit `SLAB_BYTES`, at least one."""
+        """Slices per slab."""
         width, height, depth = self.size
-        return max(1, min(THICKEST_SLAB, depth, SLAB_BYTES // (width * height * 12 * self.samples)))
+        return slab_slices(depth, width * height * 12 * self.samples)
 
     @property
     def memory(self) -> int:

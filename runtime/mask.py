@@ -18,15 +18,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from solidgrain.runtime.arguments import DoubleArray, Vector
 from solidgrain.runtime.errors import EvaluationError
 
 LARGEST = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0}  # the value that is weight 1, by type
 FINEST = 1e-6  # exemplar pixels: of its voxels
 MOST = 2**17  # voxels of a mask that are worth a look for whether a region is all one texture
 
-DoubleArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-Vector = tuple[float, float, float]
 Repeats = tuple[bool, bool, bool]  # along which axes (x, y, z), for example, the volume is read again and again
 
 

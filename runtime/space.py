@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from solidgrain.runtime.arguments import Numbers
+from solidgrain.runtime.arguments import Numbers, Vector
 from solidgrain.runtime.blend_file import BlendData, blend_of
 from solidgrain.runtime.bundle import ENCODER, MAPPING, Bundle, bundle_folder, open_again, open_bundle
 from solidgrain.runtime.errors import BundleError, ExemplarError
-from solidgrain.runtime.mask import Mask, Vector, make_mask, make_ramp
+from solidgrain.runtime.mask import Mask, make_mask, make_ramp
 from solidgrain.runtime.provider import open_session
 from solidgrain.runtime.texture import Texture, make_workers, open_texture
 from solidgrain.runtime.texture_file import TextureData

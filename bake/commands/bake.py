@@ -8,7 +8,7 @@ import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from solidgrain.bake.flags import add_arguments, make_plan
+from solidgrain.bake.flags import add_arguments, check_dither, make_plan
 from solidgrain.bake.messages import tell, tell_error
 from solidgrain.bake.modes import check_modes
 from solidgrain.bake.sources import Encoded
@@ -74,7 +74,9 @@ def planned(arguments: argparse.Namespace, encoded: Encoded) -> tuple[Plan, Text
     """The plan that the flags ask for, or the one that --plan names, and its texture."""
     if arguments.plan is None:
         texture = encoded.load(arguments) or load_texture(arguments)
-        return make_plan(arguments, texture), texture
+        plan = make_plan(arguments, texture)
+        check_dither(arguments, plan.outputs)
+        return plan, texture
     from solidgrain.bake.evaluate import check_place
     from solidgrain.bake.plan import located
     from solidgrain.bake.schema import load_plan

@@ -1,6 +1,6 @@
 """The table of writers, from suffix to file format, and the little that all formats share."""
 
-from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer
+from solidgrain.bake.writers.base import FloatArray, Option, Output, Volume, Writer, slab_slices
 from solidgrain.bake.writers.table import (
     PREVIEW,
     bounds,
@@ -13,6 +13,7 @@ from solidgrain.bake.writers.table import (
     output_bytes,
     output_exists,
     output_files,
+    rounds,
     scratch_bytes,
     suffixes,
     turned_bytes,
@@ -35,7 +36,9 @@ __all__ = [
     "output_bytes",
     "output_exists",
     "output_files",
+    "rounds",
     "scratch_bytes",
+    "slab_slices",
     "suffixes",
     "turned_bytes",
 ]

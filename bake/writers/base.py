@@ -23,6 +23,8 @@ from solidgrain.bake.store import Bytes, Encoded, Finished, Store
 from solidgrain.runtime.workers import Workers
 
 FloatArray = npt.NDArray[np.float32]
+SLAB_BYTES = 48 * 2**20  # of float32 colour; what a bake holds at a time is a small multiple of it
+THICKEST_SLAB = 16  # slices
 ROUNDING = {2: 2.0**-11, 4: 1e-6}  # by the bytes of a float: half an ulp of a colour below 2, of larger ones in proportion
 
 
@@ -73,6 +75,11 @@ class Output:
     @property
     def colorspace(self) -> str:
         return str(self.options["colorspace"])
+
+
+def slab_slices(depth: int, slice_bytes: int, slab_bytes: int | None = None) -> int:
+    """Slices of `slice_bytes` that are worked on at a time: as many as fit `slab_bytes` (`SLAB_BYTES`), at least one."""
+    return max(1, min(THICKEST_SLAB, depth, (slab_bytes or SLAB_BYTES) // slice_bytes))
 
 
 class Option(NamedTuple):

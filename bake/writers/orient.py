@@ -13,12 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from solidgrain.bake.store import Encoded, Finished, Store
-from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer, replay
+from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer, replay, slab_slices
 from solidgrain.runtime.workers import Workers
 
 UPRIGHT = "+x+y+z"
 SPOOL_BYTES = 12  # per voxel
-SLAB_BYTES, THICKEST_SLAB = 48 * 2**20, 16  # of slices of the file
 
 
 def oriented(volume: Volume, axes: str) -> Volume:
@@ -42,14 +41,10 @@ def oriented(volume: Volume, axes: str) -> Volume:
     )
 
 
-def slab_slices(volume: Volume) -> int:
-    """Slices of a turned volume that are put together at a time: at least one, however large it is."""
-    depth, height, width = volume.shape
-    return max(1, min(THICKEST_SLAB, depth, SLAB_BYTES // (height * width * 12)))
-
-
 def slab_bytes(volume: Volume) -> int:
-    return slab_slices(volume) * volume.shape[1] * volume.shape[2] * 12
+    """What a turned volume is put together from at a time."""
+    depth, height, width = volume.shape
+    return slab_slices(depth, height * width * 12) * height * width * 12
 
 
 class OrientedWriter(Writer):
@@ -71,7 +66,8 @@ class OrientedWriter(Writer):
         return replay(self._slabs(store), self.inner, store.folder / "oriented")
 
     def _slabs(self, store: Store) -> Iterator[tuple[int, FloatArray]]:
-        depth, thickness = self.inner.volume.shape[0], slab_slices(self.inner.volume)
+        depth, height, width = self.inner.volume.shape
+        thickness = slab_slices(depth, height * width * 12)
         for z in range(0, depth, thickness):
             count = min(thickness, depth - z)
             first = z if self.signs[2] == "+" else depth - z - count

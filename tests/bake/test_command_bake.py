@@ -96,6 +96,7 @@ USAGE = (
     "a.01.exr: two outputs",
     "ends in .png",
     "no use for it",
+    "no --out of whole numbers",
     "nothing to write",
     "expected at most",
 )
@@ -111,6 +112,7 @@ USAGE = (
         (["--preview", "a.jpg"], "ends in .png"),
         (["--preview", "a.png", "--dither"], "no use for it"),
         (["--preview", "a.png", "--mip-filter", "box"], "no use for it"),
+        (["--out", "a.vti", "--vti-type", "float32", "--dither"], "no --out of whole numbers"),
         (["--out", "missing/a.vti"], "does not exist"),
         (["--out", "a.vti", "--size", "1000x1000x10000000"], "free"),
         (["--out", "a.vti", "--size", "2000000x2000000x1"], "memory"),

@@ -257,7 +257,7 @@ def test_a_bake_of_large_slices_holds_no_more_than_the_plan_says(tmp_path, monke
     def slabs(shape, seed, slab, slices, **place):
         return ((z, np.full((slab, *shape[1:], 3), 0.5, np.float32)) for z in range(*slices, slab))
 
-    monkeypatch.setattr("solidgrain.bake.plan.SLAB_BYTES", 1)
+    monkeypatch.setattr("solidgrain.bake.writers.base.SLAB_BYTES", 1)
     texture = SimpleNamespace(slabs=slabs, workers=Workers(2), data=SimpleNamespace(sha256="0" * 64, sampler_sha256="0" * 64))
     side = 512 if samples == 1 else 192
     plan = plan_for(texture, make_output(tmp_path / name, **options), size=(side, side, 5), samples=samples)
