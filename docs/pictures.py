@@ -19,7 +19,7 @@ import torch
 
 from docs.carving import SHAPES, Distance, draw
 from docs.embedded import EXEMPLARS, HERE, embedded_textures, exemplar_of, find_photograph, say
-from solidgrain.export.evaluation import grain_of
+from solidgrain.export.evaluation import planes_of
 from solidgrain.export.sheet import GAP, Page, Pixels
 from solidgrain.runtime import SolidgrainError, Texture, load_texture
 from solidgrain.train.exemplar import FloatArray
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def labels(name: str, texture: Texture) -> tuple[str, str, str, str]:
     """What is written under a row's panels."""
     photograph = Path(exemplar_of(texture.bundle)["exemplar"]).stem
-    grain = grain_of(texture.bundle)
+    grain = planes_of(texture.bundle).grain
     oblique = "oblique slice" if grain == "none" else f"slice turned about {grain}, the grain"
     return f"{name}: {photograph}", "axis-aligned slice", oblique, "cut out of the solid"
 
@@ -59,7 +59,7 @@ def labels(name: str, texture: Texture) -> tuple[str, str, str, str]:
 def panels(texture: Texture, photograph: FloatArray | None, shape: Distance, scale: int) -> list[Pixels]:
     """A row's four pictures, `scale` screen pixels per exemplar pixel; white where there is no photograph."""
     crop = np.ones((SIDE, SIDE, 3), np.float32) if photograph is None else middle(photograph)
-    grain = grain_of(texture.bundle)
+    grain = planes_of(texture.bundle).grain
     slices = [plane(texture, rotation) for rotation in (np.eye(3), oblique_rotation(grain))]
     enlarged = [picture.repeat(scale, 0).repeat(scale, 1) for picture in (crop, *slices)]
     carved = draw(texture, shape, SIDE * scale, SIDE, up="z" if grain == "none" else grain, seed=SEED)

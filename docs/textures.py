@@ -20,7 +20,8 @@ import torch
 
 from docs.embedded import EXEMPLARS, HERE, embedded_textures, exemplar_of, find_photograph, say
 from solidgrain.bake.arguments import parse_count, parse_positive
-from solidgrain.export.evaluation import grain_of, measure, write_quality
+from solidgrain.export.card import turned
+from solidgrain.export.evaluation import measure, planes_of, write_quality
 from solidgrain.export.figures import Figures, make_figures
 from solidgrain.runtime import SolidgrainError, UsageError, load_texture
 from solidgrain.runtime.bundle import Bundle
@@ -133,13 +134,13 @@ def means_of(found: Found) -> tuple[list[float], list[float]]:
 def section(name: str, bundle: Bundle, found: Found | None) -> str:
     """All that there is to say of a texture."""
     _, photograph, license, credit, *_ = summary(name, bundle, found)
-    training, grain = bundle.manifest["training"], grain_of(bundle)
-    turned = "turned freely" if grain == "none" else f"turned about the {grain} axis only"
+    training = bundle.manifest["training"]
     uneven = (found or {}).get("nonstationarity", 0)
     change = f"; changes across itself: nonstationarity {uneven:.2f}, above {NONSTATIONARY}" if uneven > NONSTATIONARY else ""
     facts = [
         f"- photograph: {photograph}, licence {license}, credit {credit}{change}",
-        f"- training: {training['iterations']:,} iterations, {training['minutes']:g} minutes; slices {turned}",
+        f"- training: {training['iterations']:,} iterations, {training['minutes']:g} minutes; "
+        f"slices {turned(planes_of(bundle))}",
         f"- bundle: {bundle.size / 1024:.0f} KB; "
         f"{bundle.manifest['octaves']} octaves, {bundle.manifest['width']} units a layer",
     ]

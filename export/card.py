@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from solidgrain.train.slices import Planes
+
 QUALITY = "## Quality"
 MANY = 8  # exemplars that get a line each
 
@@ -15,7 +17,7 @@ def write_card(name: str, training: dict[str, Any]) -> str:
         ("settings", f"preset `{settings['preset']}`, seed {settings['seed']}"),
         ("patches", f"{settings['batch']} of {_sides(training)} pixels per iteration"),
         ("octaves", f"{settings['octaves']}, span {settings['octave_span']:g}"),
-        ("slices", "turned freely" if settings["grain"] == "none" else f"turned about the {settings['grain']} axis only"),
+        ("slices", turned(Planes(settings["grain"], settings.get("upright", False)))),
         ("iterations", f"{training['iterations']:,}"),
         ("minutes", f"{training['minutes']:g}"),
         ("trained by", f"solidgrain {training['revision']}"),
@@ -37,6 +39,14 @@ def write_card(name: str, training: dict[str, Any]) -> str:
     kind = "A space of solid textures" if settings.get("latent") else "A solid texture"
     lines = [f"# {name}", "", f"{kind}, trained on:", "", *exemplars, "", "| | |", "|---|---|"]
     return "\n".join([*lines, *(f"| {label} | {value} |" for label, value in rows), ""])
+
+
+def turned(planes: Planes) -> str:
+    """How training turned its slices, in words."""
+    if planes.grain == "none":
+        return "turned freely"
+    across = "xz" if planes.grain == "x" else "zy"
+    return f"turned about the {planes.grain} axis only" + f", upright, from xy to {across}" * planes.upright
 
 
 def _sides(training: dict[str, Any]) -> str:

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     import torch
 
-    from solidgrain.export.evaluation import exemplar_scale, grain_of, is_exemplar, measure, write_quality
+    from solidgrain.export.evaluation import exemplar_scale, is_exemplar, measure, planes_of, write_quality
     from solidgrain.export.sheet import make_sheet, write_sheet
     from solidgrain.runtime import load_texture
     from solidgrain.runtime.blend_file import BlendData
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     }
     print(json.dumps(about | found.as_json(), indent=2) if arguments.json else figures.markdown())
     if arguments.sheet:
-        sheet = make_sheet(texture.name, exemplar, texture.sample, grain_of(texture.bundle), found.pairs, figures)
+        sheet = make_sheet(texture.name, exemplar, texture.sample, planes_of(texture.bundle), found.pairs, figures)
         write_sheet(arguments.sheet, sheet)
     if arguments.card:
         write_quality(texture, figures)

@@ -19,6 +19,7 @@ from solidgrain.train.inception import Inception
 from solidgrain.train.photograph import scaled
 from solidgrain.train.quality import Evaluation, evaluate
 from solidgrain.train.run import pixels_sha256
+from solidgrain.train.slices import Planes
 
 
 class Measured(NamedTuple):
@@ -36,9 +37,10 @@ class Measured(NamedTuple):
         return asdict(self.evaluation) | {"copying": asdict(self.copying)}
 
 
-def grain_of(bundle: Bundle) -> str:
-    """The axis about which slices were turned in training, or "none"."""
-    return str(bundle.manifest["training"].get("settings", {}).get("grain", "none"))
+def planes_of(bundle: Bundle) -> Planes:
+    """The planes that training saw."""
+    settings = bundle.manifest["training"].get("settings", {})
+    return Planes(str(settings.get("grain", "none")), bool(settings.get("upright", False)))
 
 
 def exemplar_of(bundle: Bundle) -> dict[str, str]:
@@ -79,10 +81,10 @@ def measure(
 
     `on_step` is told when the second begins: in a photograph of 12 megapixels it takes minutes.
     """
-    grain, (height, width) = grain_of(texture.bundle), exemplar.shape[:2]
-    evaluation = evaluate(exemplar, texture.sample, slices, grain, inception)
+    planes, (height, width) = planes_of(texture.bundle), exemplar.shape[:2]
+    evaluation = evaluate(exemplar, texture.sample, slices, planes, inception)
     on_step(f"searching {width}x{height} pixels for what may have been copied")
-    return Measured(evaluation, *measure_copying(exemplar, texture.sample, grain))
+    return Measured(evaluation, *measure_copying(exemplar, texture.sample, planes))
 
 
 def write_quality(texture: Texture, figures: Figures) -> None:

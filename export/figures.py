@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from solidgrain.train.quality import Evaluation
 
 
+DIRECTED = 2.0  # times the floor, by VGG-Fréchet: where an exemplar is as far from itself turned, and slices from it
+
+
 @dataclass(frozen=True)
 class Figures:
     """A table with a sentence before it and one after it."""
@@ -41,15 +44,29 @@ def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
                 *(f"{evaluation.among[name]:.2f}" for _ in among),
             )
         )
-    uneven = evaluation.nonstationarity > NONSTATIONARY
-    change = f" The exemplar changes across itself (nonstationarity {evaluation.nonstationarity:.2f}, above {NONSTATIONARY})."
+    after = [about(copying), *directed(evaluation)]
+    if evaluation.nonstationarity > NONSTATIONARY:
+        figure = f"{evaluation.nonstationarity:.2f}, above {NONSTATIONARY}"
+        after.append(f"The exemplar changes across itself (nonstationarity {figure}).")
     return Figures(
         f"Distances to the exemplar over its own floor, mean ± standard deviation over {evaluation.slices} slices of "
         f"{evaluation.crop}² pixels, through the runtime:",
         ("measure", "floor", f"exemplar {evaluation.turn}", "axis-aligned slices", "oblique slices", *among),
         rows,
-        f"{about(copying)}{change * uneven}",
+        " ".join(after),
     )
+
+
+def directed(evaluation: Evaluation) -> list[str]:
+    """What to do about slices that are far from their exemplar since they turn and it has a direction; nothing about others."""
+    turned, slices = evaluation.turned["vgg_frechet"], evaluation.oblique["vgg_frechet"][0]
+    if evaluation.upright or min(turned, slices) <= DIRECTED:
+        return []
+    flags = "--upright" if evaluation.grain != "none" else "--anisotropic, and --upright if light falls from one side,"
+    return [
+        f"The exemplar has a direction ({turned:.1f} times its floor when {evaluation.turn}) that slices do not keep: "
+        f"train with {flags} for slices that do."
+    ]
 
 
 def about(copying: Copying) -> str:

@@ -24,6 +24,7 @@ from solidgrain.train.copying import Pair
 from solidgrain.train.cuts import Sample, axis_rotation, oblique_rotation, take_slices
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.preview import Pixels, as_png
+from solidgrain.train.slices import Planes
 
 PANEL = 256  # pixels along each side of a picture: at most of the exemplar, at least on the sheet
 ENLARGED = 6  # screen pixels per pixel of a patch
@@ -47,16 +48,16 @@ class Sheet:
     figures: Figures
 
 
-def make_sheet(name: str, exemplar: FloatArray, sample: Sample, grain: str, pairs: list[Pair], figures: Figures) -> Sheet:
+def make_sheet(name: str, exemplar: FloatArray, sample: Sample, planes: Planes, pairs: list[Pair], figures: Figures) -> Sheet:
     """Draw everything that a sheet shows."""
     size = min(*exemplar.shape[:2], PANEL)
     top, left = ((extent - size) // 2 for extent in exemplar.shape[:2])
-    wide = _slices(sample, 2 * size, grain, axis=True, count=1)[0].reshape(size, 2, size, 2, 3).mean((1, 3))
+    wide = _slices(sample, 2 * size, planes, axis=True, count=1)[0].reshape(size, 2, size, 2, 3).mean((1, 3))
     rows = [
         [("exemplar", exemplar[top : top + size, left : left + size])]
-        + [(f"axis-aligned slice {i}", one) for i, one in enumerate(_slices(sample, size, grain, axis=True), 1)],
+        + [(f"axis-aligned slice {i}", one) for i, one in enumerate(_slices(sample, size, planes, axis=True), 1)],
         [("twice the width", wide)]
-        + [(f"oblique slice {i}", one) for i, one in enumerate(_slices(sample, size, grain, axis=False), 1)],
+        + [(f"oblique slice {i}", one) for i, one in enumerate(_slices(sample, size, planes, axis=False), 1)],
     ]
     scale = -(-PANEL // size)
     shown = [[(label, _enlarged(picture, scale)) for label, picture in row] for row in rows]
@@ -77,11 +78,11 @@ def write_sheet(path: Path, sheet: Sheet) -> None:
         raise SolidgrainError(f"--sheet {path}: cannot write ({error.strerror})") from error
 
 
-def _slices(sample: Sample, size: int, grain: str, axis: bool, count: int = 3) -> list[FloatArray]:
+def _slices(sample: Sample, size: int, planes: Planes, axis: bool, count: int = 3) -> list[FloatArray]:
     """Slices of as many instances, at fixed random places."""
 
     def rotation_of(seed: int, generator: torch.Generator) -> Tensor:
-        return axis_rotation(seed, grain) if axis else oblique_rotation(generator, grain)
+        return axis_rotation(seed, planes) if axis else oblique_rotation(generator, planes)
 
     return list(take_slices(sample, size, count, rotation_of))
 

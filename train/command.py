@@ -53,6 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="oriented material: slices turn about the grain, image axis x or y (measured if not given)",
     )
     add(
+        "--upright",
+        action="store_true",
+        default=None,
+        help="with --anisotropic: neither mirrored nor seen from behind, for light from one side",
+    )
+    add(
         "--patch-scale",
         type=parse_scale,
         metavar="S",

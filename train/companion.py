@@ -31,6 +31,7 @@ SEEN = (
     "transposed",
     "rotations",
     "grain",
+    "upright",
     "relative_gram",
     "critic_contrast",
 )  # the settings of what D sees and L_style asks

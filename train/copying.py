@@ -18,6 +18,7 @@ from torch import Tensor
 
 from solidgrain.train.cuts import Sample, as_image, axis_rotation, cut, oblique_rotation, random_place
 from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.slices import ALL_PLANES, Planes
 
 SIDE = 15  # pixels along each side of a patch
 SLICES, SLICE = 16, 64  # half of them axis-aligned, half oblique; pixels along each side
@@ -51,18 +52,18 @@ class Pair(NamedTuple):
 
 
 @torch.no_grad()
-def measure_copying(exemplar: FloatArray, sample: Sample, grain: str = "none") -> tuple[Copying, list[Pair]]:
+def measure_copying(exemplar: FloatArray, sample: Sample, planes: Planes = ALL_PLANES) -> tuple[Copying, list[Pair]]:
     """Compare patches of a texture with their nearest in the exemplar, and return the nearest pairs of all as well.
 
     The search is exhaustive: every place in the exemplar, in each orientation in which training may have shown it.
     """
     image = as_image(exemplar)
     count = min(MOST, max(FEWEST, MOST * 2**18 // (image.shape[2] * image.shape[3]))) // SLICES * SLICES
-    found, nearest = search(image, made := _synthesised(sample, count, grain), grain)
+    found, nearest = search(image, made := _synthesised(sample, count, planes), planes.grain)
     first, second = image.tensor_split(2, dim=2 if image.shape[2] > image.shape[3] else 3)
     generator = torch.Generator().manual_seed(2)
     halves = [(first, _patches(second, count // 2, generator)), (second, _patches(first, count // 2, generator))]
-    floor = torch.cat([search(half, patches, grain)[0] for half, patches in halves])
+    floor = torch.cat([search(half, patches, planes.grain)[0] for half, patches in halves])
     median = float(floor.median())
     pairs = [Pair(_as_array(made[i]), _as_array(nearest[i]), float(found[i])) for i in found.argsort()[:SHOWN].tolist()]
     if median < SMALLEST_FLOOR:
@@ -119,12 +120,12 @@ def _nearest_places(image: Tensor, patches: Tensor) -> tuple[Tensor, Tensor, Ten
     return least, place // columns, place % columns
 
 
-def _synthesised(sample: Sample, count: int, grain: str) -> Tensor:
+def _synthesised(sample: Sample, count: int, planes: Planes) -> Tensor:
     """Patches [count, 3, SIDE, SIDE] of slices of as many instances."""
     patches = []
     for seed in range(SLICES):
         generator = torch.Generator().manual_seed(seed)
-        rotation = oblique_rotation(generator, grain) if seed % 2 else axis_rotation(seed // 2, grain)
+        rotation = oblique_rotation(generator, planes) if seed % 2 else axis_rotation(seed // 2, planes)
         image = as_image(cut(sample, SLICE, rotation, seed, random_place(generator)))
         patches.append(_patches(image, count // SLICES, generator))
     return torch.cat(patches)

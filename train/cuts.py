@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import numpy.typing as npt
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from solidgrain.train.exemplar import FloatArray
-from solidgrain.train.slices import UNIT, about_axis, flat_slice, from_quaternions, upright
+from solidgrain.train.slices import UNIT, Planes, flat_slice
 
 Sample = Callable[[npt.NDArray[np.float64], int], FloatArray]  # points [P, 3] in exemplar pixels, seed -> rgb [P, 3]
 RotationOf = Callable[[int, torch.Generator], Tensor]  # seed, its random stream -> [3, 3]
@@ -41,17 +40,15 @@ def random_place(generator: torch.Generator) -> Tensor:
     return REACH * torch.rand(3, generator=generator, dtype=torch.float64)
 
 
-def axis_rotation(number: int, grain: str) -> Tensor:
+def axis_rotation(number: int, planes: Planes) -> Tensor:
     """Planes along the axes, in turn: all three of them, or the two that hold the grain's axis."""
-    planes = upright(grain, torch.device("cpu"))
-    return planes[number % len(planes)]
+    rotations = planes.along_axes()
+    return rotations[number % len(rotations)]
 
 
-def oblique_rotation(generator: torch.Generator, grain: str) -> Tensor:
-    """Any orientation, or any about the grain's axis."""
-    if grain != "none":
-        return about_axis("xyz".index(grain), 2 * torch.pi * torch.rand(1, generator=generator))[0]
-    return from_quaternions(F.normalize(torch.randn(1, 4, generator=generator), dim=1))[0]
+def oblique_rotation(generator: torch.Generator, planes: Planes) -> Tensor:
+    """Any of the planes."""
+    return planes.turned(1, generator)[0]
 
 
 def as_image(pixels: FloatArray) -> Tensor:

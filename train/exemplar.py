@@ -20,7 +20,7 @@ FRAMED = 3.0  # `edge_step` above which an image has a frame: photographs of sto
 
 
 def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:
-    """Random crops of the exemplar [3, H, W], each flipped left-right and up-down by chance: [B, 3, patch, patch].
+    """Random crops of the exemplar [3, H, W], each flipped by chance unless it must stay upright: [B, 3, patch, patch].
 
     An isotropic material looks the same turned by 90°, so its crops are also transposed by chance.
     """
@@ -32,7 +32,12 @@ def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generato
 
 
 def flip_by_chance(crop: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:
-    """A crop [3, H, W], mirrored along each axis by chance, and transposed where the material has no grain."""
+    """A crop [3, H, W], mirrored along each axis by chance, and transposed where the material has no grain.
+
+    Of what must stay upright, as it is.
+    """
+    if settings.upright:
+        return crop
     crop = crop.flip([axis for axis in (1, 2) if uniform_below(2, generator)])
     transposed = settings.transposed and settings.grain == "none" and uniform_below(2, generator)
     return crop.transpose(1, 2) if transposed else crop

@@ -30,6 +30,7 @@ from solidgrain.train.cuts import RotationOf, Sample, as_image, axis_rotation, o
 from solidgrain.train.exemplar import FloatArray, nonstationarity
 from solidgrain.train.inception import Inception
 from solidgrain.train.losses import gram_difference, gram_matrices
+from solidgrain.train.slices import ALL_PLANES, Planes
 from solidgrain.train.vgg import STYLE_LAYERS, Vgg
 
 Measures = dict[str, float]
@@ -54,6 +55,7 @@ class Evaluation:
     turned: Measures  # the exemplar itself, as `turn` says: far above 1 where it has a direction
     nonstationarity: float = 0.0  # of the exemplar
     grain: str = "none"  # the image axis about which slices turn
+    upright: bool = False  # by a quarter at most
     among: Measures = field(default_factory=dict)  # each oblique slice from the next: at 1 they vary as the exemplar's parts do
 
     @property
@@ -63,11 +65,11 @@ class Evaluation:
 
 @torch.no_grad()
 def evaluate(
-    exemplar: FloatArray, sample: Sample, slices: int = 10, grain: str = "none", inception: Inception | None = None
+    exemplar: FloatArray, sample: Sample, slices: int = 10, planes: Planes = ALL_PLANES, inception: Inception | None = None
 ) -> Evaluation:
     """Measure axis-aligned and oblique slices of a texture, one of each per seed, against its exemplar.
 
-    With a grain only those orientations are taken that a slice through its axis has, since no loss ever saw the others.
+    Slices are taken in those planes alone that training saw.
     Raises ExemplarError if the exemplar's parts are all the same: there is no floor then.
     """
     measure = Measure(inception)
@@ -81,14 +83,14 @@ def evaluate(
             f"the exemplar has the same colours in each of its squares of {size}² pixels, so that nothing tells how far apart "
             "its own parts are; expected a photograph that neither repeats itself nor is of one colour, or one period of it"
         )
-    others = [measure.statistics(turned_as_slices_are(square, grain)) for square in squares]
+    others = [measure.statistics(turned_as_slices_are(square, planes.grain)) for square in squares]
     turned = _mean(measure.distances(a, b) for i, a in enumerate(crops) for j, b in enumerate(others) if i != j)
 
     def pictures(rotation_of: RotationOf) -> Iterator[Statistics]:
         return (measure.statistics(as_image(one)) for one in take_slices(sample, size, slices, rotation_of))
 
-    axis, _ = compared(measure, pictures(lambda seed, generator: axis_rotation(seed, grain)), crops, floor)
-    oblique, among = compared(measure, pictures(lambda seed, generator: oblique_rotation(generator, grain)), crops, floor)
+    axis, _ = compared(measure, pictures(lambda seed, generator: axis_rotation(seed, planes)), crops, floor)
+    oblique, among = compared(measure, pictures(lambda seed, generator: oblique_rotation(generator, planes)), crops, floor)
     return Evaluation(
         crop=size,
         slices=slices,
@@ -97,13 +99,14 @@ def evaluate(
         oblique=oblique,
         turned={name: turned[name] / floor[name] for name in floor},
         nonstationarity=nonstationarity(exemplar),
-        grain=grain,
+        grain=planes.grain,
+        upright=planes.upright,
         among=among,
     )
 
 
 def turned_as_slices_are(image: Tensor, grain: str) -> Tensor:
-    """What slices show as often as the image itself: it turned by 90°, or by 180° about its grain, as seen from behind."""
+    """What slices show as often as the image itself, unless they are upright: it turned by 90°, or its grain from behind."""
     return image.rot90(1, (2, 3)) if grain == "none" else image.flip(2 if grain == "x" else 3)
 
 

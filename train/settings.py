@@ -42,6 +42,7 @@ class Settings:
     # uniform on SO(3), the authors' three angles in [0°, 90°], or along the axes only (Henzler et al. 2020)
     rotations: Literal["uniform", "euler", "axis"] = "uniform"
     grain: Literal["none", "x", "y"] = "none"  # the image axis about which slices turn; "none" turns them freely
+    upright: bool = False  # patches are never mirrored, and slices turn by a quarter about the grain: none is seen from behind
     grain_ratio: float = 1.0  # length of the structures across the grain over along it, at the start
 
     # Losses (Eq. 3, Eq. 4)

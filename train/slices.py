@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -12,6 +13,35 @@ from solidgrain.train.settings import Settings
 
 UNIT = 64.0  # pixels per unit of the coordinates that the octaves act on
 REACH = 64.0  # units in which places are scattered
+
+
+class Planes(NamedTuple):
+    """Which planes through a solid look like the photograph: all of them, or those that hold the axis of its grain.
+
+    Among the latter a plane that is turned by 180° is the same one seen from behind, the photograph's mirror image. Of what is
+    not its own mirror image, as where light falls from one side, those look like it that are `upright`: from xy to xz, or from
+    xy to zy, where the grain runs along y. The authors' code draws its angles from such a quarter, too.
+    """
+
+    grain: str = "none"  # "none", "x" or "y"
+    upright: bool = False
+
+    def along_axes(self) -> Tensor:
+        """The planes along the axes, as rotations [K, 3, 3] of xy: xy, xz and zy, or the two of them that hold the grain."""
+        quarter = torch.tensor([math.pi / 2])
+        xy, xz, zy = torch.eye(3), about_axis(0, quarter)[0], about_axis(1, quarter)[0]
+        return torch.stack({"none": [xy, xz, zy], "x": [xy, xz], "y": [xy, zy]}[self.grain])
+
+    def turned(self, count: int, generator: torch.Generator) -> Tensor:
+        """Rotations [count, 3, 3] of xy, drawn evenly: from SO(3), through unit quaternions, or about the grain."""
+        device = generator.device
+        if self.grain == "none":
+            return from_quaternions(F.normalize(torch.randn(count, 4, generator=generator, device=device), dim=1))
+        angles = (0.5 if self.upright else 2.0) * math.pi * torch.rand(count, generator=generator, device=device)
+        return about_axis("xyz".index(self.grain), angles)
+
+
+ALL_PLANES = Planes()
 
 
 def draw_slices(settings: Settings, generator: torch.Generator) -> Tensor:
@@ -44,26 +74,16 @@ def draw_rotations(settings: Settings, generator: torch.Generator) -> Tensor:
     """Rotation matrices [B, 3, 3]: free for isotropic materials, about the grain's axis for anisotropic ones.
 
     The paper asks for "all possible slice orientations"; its code draws three Euler angles from [0°, 90°], which favours
-    some. "uniform" draws from SO(3) evenly, through unit quaternions. "axis" is what Henzler et al. (2020) do.
+    some. "axis" is what Henzler et al. (2020) do.
     """
-    batch, device = settings.batch, generator.device
+    batch, device, planes = settings.batch, generator.device, Planes(settings.grain, settings.upright)
     if settings.rotations == "axis":
-        planes = upright(settings.grain, device)
-        return planes[torch.randint(len(planes), (batch,), generator=generator, device=device)]
-    if settings.grain != "none":
-        angles = 2 * math.pi * torch.rand(batch, generator=generator, device=device)
-        return about_axis("xyz".index(settings.grain), angles)
-    if settings.rotations == "euler":
+        rotations = planes.along_axes().to(device)
+        return rotations[torch.randint(len(rotations), (batch,), generator=generator, device=device)]
+    if settings.rotations == "euler" and settings.grain == "none":
         angles = 0.5 * math.pi * torch.rand(3, batch, generator=generator, device=device)
         return about_axis(2, angles[2]) @ about_axis(1, angles[1]) @ about_axis(0, angles[0])
-    return from_quaternions(F.normalize(torch.randn(batch, 4, generator=generator, device=device), dim=1))
-
-
-def upright(grain: str, device: torch.device) -> Tensor:
-    """The planes along the axes, as rotations [K, 3, 3] of xy: xy, xz and zy, or the two of them that hold the grain."""
-    quarter = torch.tensor([math.pi / 2], device=device)
-    xy, xz, zy = torch.eye(3, device=device), about_axis(0, quarter)[0], about_axis(1, quarter)[0]
-    return torch.stack({"none": [xy, xz, zy], "x": [xy, xz], "y": [xy, zy]}[grain])
+    return planes.turned(batch, generator)
 
 
 def about_axis(axis: int, angles: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ from solidgrain.train.inception import Inception
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import evaluate
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings
-from solidgrain.train.slices import from_quaternions, upright
+from solidgrain.train.slices import Planes, from_quaternions
 from solidgrain.train.variants import vary
 from tests.bench import cells
 
@@ -104,19 +104,20 @@ def finish_cell(
     """Train and measure one method on one exemplar, unless that was done before."""
     settings = with_grain(COLUMNS[column], "auto" if folder.name == "wood" else None, exemplar)
 
+    planes = Planes(settings.grain, settings.upright)
+
     def measured(sample: Sample) -> dict[str, Any]:
-        cells.write_png(folder / f"{column}.png", slice_picture(sample, settings.grain))
-        return {"quality": asdict(evaluate(exemplar, sample, slices, settings.grain, inception))}
+        cells.write_png(folder / f"{column}.png", slice_picture(sample, planes))
+        return {"quality": asdict(evaluate(exemplar, sample, slices, planes, inception))}
 
     result = folder / f"{column}.json"
     cells.finish(result, folder / column, settings, exemplar, budget, device, {"method": column}, measured)
 
 
-def slice_picture(sample: Sample, grain: str, size: int = 256) -> FloatArray:
+def slice_picture(sample: Sample, planes: Planes, size: int = 256) -> FloatArray:
     """An oblique slice of instance 0, or one that holds the grain."""
-    oblique = (
-        from_quaternions(torch.tensor([[0.5, 0.1, 0.7, 0.5]]))[0] if grain == "none" else upright(grain, torch.device("cpu"))[0]
-    )
+    free = planes.grain == "none"
+    oblique = from_quaternions(torch.tensor([[0.5, 0.1, 0.7, 0.5]]))[0] if free else planes.along_axes()[0]
     picture: FloatArray = sample(cells.plane(size, oblique, np.zeros(3)), 0).reshape(size, size, 3)
     return picture
 

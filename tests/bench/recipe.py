@@ -34,6 +34,7 @@ from solidgrain.train.inception import Inception
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import evaluate
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings
+from solidgrain.train.slices import Planes
 from tests.bench import cells, curves
 
 DEFAULTS = [  # the embedded critic, which FAST starts from, has seen none of them
@@ -104,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         for row in arguments.only or ROWS:
             for name, exemplar in (exemplars | grained).items():
                 settings = replace(ROWS[row][1], seed=seed, **changes)
-                settings = with_grain(settings, "auto" if name in grained else None, exemplar)
+                settings = with_grain(settings, "auto" if name in grained else None, exemplar, settings.upright)
                 folder = arguments.out / row / f"{name}-{seed}"
                 for mark in arguments.marks:
                     finish_mark(folder, settings, exemplar, mark, arguments.by, arguments.slices, device, inception)
@@ -172,8 +173,10 @@ def finish_mark(
     result = folder.with_name(f"{folder.name}-{mark:g}.json")
     budget = Budget(minutes=mark) if by == "minutes" else Budget(iterations=round(mark))
 
+    planes = Planes(settings.grain, settings.upright)
+
     def measured(sample: Sample) -> dict[str, Any]:
-        return {"quality": asdict(evaluate(exemplar, sample, slices, settings.grain, inception))}
+        return {"quality": asdict(evaluate(exemplar, sample, slices, planes, inception))}
 
     facts = {"exemplar": folder.name, "mark": mark}
     cells.finish(result, folder, settings, exemplar, budget, device, facts, measured)

@@ -21,6 +21,7 @@ from torch import Tensor
 from solidgrain.train.cuts import Sample, as_image, axis_rotation, cut, oblique_rotation, random_place
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.quality import Measure, Statistics, disjoint_crops
+from solidgrain.train.slices import Planes
 from tests.bench.likelihood import BANDWIDTHS, log_likelihoods, take_patches
 
 KINDS = ("oblique", "axis")  # orientations of slices, reported apart
@@ -135,17 +136,17 @@ class Reference:
 
 
 @torch.no_grad()
-def measure_slices(reference: Reference, sample: Sample, slices: int, grain: str) -> dict[str, Figures]:
+def measure_slices(reference: Reference, sample: Sample, slices: int, planes: Planes) -> dict[str, Figures]:
     """Of each kind of orientation, a slice of each of so many instances."""
-    views = list(_views(sample, reference.size, slices, grain))
+    views = list(_views(sample, reference.size, slices, planes))
     return {kind: reference.of_slices([view[k] for view in views]) for k, kind in enumerate(KINDS)}
 
 
-def _views(sample: Sample, size: int, slices: int, grain: str) -> Iterator[tuple[Tensor, ...]]:
+def _views(sample: Sample, size: int, slices: int, planes: Planes) -> Iterator[tuple[Tensor, ...]]:
     """Both kinds of one instance after another: making an instance takes longer than a slice of it."""
     turned: dict[str, Callable[[int, torch.Generator], Tensor]] = {
-        "axis": lambda seed, generator: axis_rotation(seed, grain),
-        "oblique": lambda seed, generator: oblique_rotation(generator, grain),
+        "axis": lambda seed, generator: axis_rotation(seed, planes),
+        "oblique": lambda seed, generator: oblique_rotation(generator, planes),
     }
     for seed in range(slices):
         generator = torch.Generator().manual_seed(seed)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from solidgrain.export.evaluation import grain_of
+from solidgrain.export.evaluation import planes_of
 from solidgrain.runtime import Space
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.photograph import read_exemplar
@@ -51,9 +51,9 @@ def write_interpolations(path: Path, space: Space, exemplars: Sequence[FloatArra
     rows = []
     for number, (first, second) in enumerate(chosen):
         cells.say(f"interpolation {number + 1} of {len(chosen)}")
-        ends, grain = [space.encode(one) for one in (first, second)], grain_of(space.bundle)
+        ends, planes = [space.encode(one) for one in (first, second)], planes_of(space.bundle)
         between = [space.blend(ends[0], ends[1], float(at)) for at in np.linspace(0, 1, SQUARES)]
-        slices = [slice_picture(texture.sample, grain, space.patch) for texture in between]
+        slices = [slice_picture(texture.sample, planes, space.patch) for texture in between]
         rows.append(_joined([first, *slices, second], axis=1))
     cells.write_png(path, _joined(rows, axis=0))
 

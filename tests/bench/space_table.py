@@ -25,7 +25,7 @@ import OpenImageIO as oiio
 import torch
 
 from solidgrain.bake.arguments import parse_count, parse_positive, parse_scale, parse_seconds
-from solidgrain.export.evaluation import grain_of
+from solidgrain.export.evaluation import planes_of
 from solidgrain.runtime import SolidgrainError, Space, UsageError, load_space
 from solidgrain.runtime.bundle import ENCODER, MAPPING, SAMPLER
 from solidgrain.runtime.workers import usable_threads
@@ -219,8 +219,8 @@ def finish_cells(subject: Subject, columns: Sequence[str], methods: Methods, mea
     if not exemplar.exists():
         write_exactly(exemplar, patch)
     reference = Reference(cut_crops(as_image(subject.pixels), subject.patch), measure)
-    grain, count = (
-        grain_of(methods.space.bundle),
+    planes, count = (
+        planes_of(methods.space.bundle),
         min(slices, LARGE_SLICES) if subject.folder.parent.name == "large" else slices,
     )
     for column in columns:
@@ -230,10 +230,10 @@ def finish_cells(subject: Subject, columns: Sequence[str], methods: Methods, mea
             found = {**reference.facts(), "truth": reference.of_truth()}
         else:
             sample = methods.sample(column, patch, subject.folder)
-            found = {"slices": count, **measure_slices(reference, sample, count, grain)}
+            found = {"slices": count, **measure_slices(reference, sample, count, planes)}
             if column in ADAPTED:
                 found["adapting"] = cells.kept(subject.folder / f"{column}-adapted.json")
-            cells.write_png(subject.folder / f"{column}.png", slice_picture(sample, grain, subject.patch))
+            cells.write_png(subject.folder / f"{column}.png", slice_picture(sample, planes, subject.patch))
         cells.keep(subject.folder / f"{column}.json", found)
 
 

@@ -68,8 +68,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def measured(texture, exemplar, slices):
     """Stands in for `measure`: a texture is as far from its photograph as that is bright."""
     bright = float(exemplar.mean())
-    found = {"gram": (bright, 0.25), "color": (1 + bright, 0.5)}
-    floor, turned = {"gram": 0.125, "color": 2.5}, {"gram": 1.0, "color": 1.0}
+    found = {"gram": (bright, 0.25), "vgg_frechet": (1 + bright, 0.5)}
+    floor, turned = {"gram": 0.125, "vgg_frechet": 2.5}, {"gram": 1.0, "vgg_frechet": 1.0}
     return Measured(Evaluation(64, slices, floor, found, found, turned), Copying(256, 0.1, 1.25, 0.004), [])
 
 

@@ -25,6 +25,7 @@ from solidgrain.runtime import load_texture
 from solidgrain.runtime.errors import SolidgrainError
 from solidgrain.train.copying import Pair
 from solidgrain.train.preview import as_png
+from solidgrain.train.slices import ALL_PLANES
 from tests.train.conftest import blotches
 
 EXEMPLAR = blotches(80, 96)
@@ -39,7 +40,7 @@ def coordinates(points, seed):
 
 @pytest.fixture(scope="module")
 def sheet():
-    return make_sheet("toy", EXEMPLAR, coordinates, "none", PAIRS, FIGURES)
+    return make_sheet("toy", EXEMPLAR, coordinates, ALL_PLANES, PAIRS, FIGURES)
 
 
 def pixels_of(data, tmp_path):
@@ -126,7 +127,7 @@ def test_a_png_that_we_write_is_what_openimageio_reads(tmp_path):
 def test_a_sheet_is_the_same_bytes_every_time(sheet, tmp_path, name):
     write_sheet(tmp_path / name, sheet)
     first = (tmp_path / name).read_bytes()
-    write_sheet(tmp_path / name, make_sheet("toy", EXEMPLAR, coordinates, "none", PAIRS, FIGURES))
+    write_sheet(tmp_path / name, make_sheet("toy", EXEMPLAR, coordinates, ALL_PLANES, PAIRS, FIGURES))
     assert (tmp_path / name).read_bytes() == first
 
 

@@ -9,6 +9,7 @@ import torch
 from solidgrain.export.figures import about
 from solidgrain.train.copying import SHOWN, SIDE, measure_copying, search
 from solidgrain.train.cuts import as_image
+from solidgrain.train.slices import Planes
 from tests.train.conftest import blotches
 
 MATERIAL = blotches(128, 256)
@@ -58,7 +59,7 @@ def test_half_a_copy_shows_in_the_share():
 
 
 def test_with_a_grain_transposed_patches_are_no_copies():
-    copying, _ = measure_copying(EXEMPLAR, crops_of(np.ascontiguousarray(EXEMPLAR.transpose(1, 0, 2))), grain="x")
+    copying, _ = measure_copying(EXEMPLAR, crops_of(np.ascontiguousarray(EXEMPLAR.transpose(1, 0, 2))), planes=Planes("x"))
     assert copying.ratio > 0.8
 
 

@@ -197,6 +197,13 @@ def test_patches_come_from_the_exemplar_flipped_and_transposed(photograph):
     assert all(min(abs(patch.sum().item() - crop) for crop in crops) < 0.05 for patch in patches)
 
 
+def test_upright_patches_are_crops_as_they_are(photograph):
+    image = torch.from_numpy(read_exemplar(photograph, 64)).permute(2, 0, 1)
+    patches = draw_patches(image, preset("fast", batch=32, grain="x", upright=True), torch.Generator().manual_seed(0))
+    crops = torch.stack([image[:, y : y + 64, x : x + 64] for y in range(17) for x in range(33)])
+    assert all((crops == patch).flatten(1).all(1).any() for patch in patches)
+
+
 def test_the_grain_of_stripes_is_along_them():
     draw = np.random.default_rng(0)
     rows = np.repeat(np.convolve(draw.random(260), np.ones(5) / 5, "valid")[:, None], 256, axis=1)

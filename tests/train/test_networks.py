@@ -222,6 +222,18 @@ def test_slices_of_a_grained_material_all_hold_the_grain():
     torch.testing.assert_close(along, torch.tensor([1 / 64, 0, 0]).expand_as(along), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("rotations", ["uniform", "axis"])
+@pytest.mark.parametrize(("grain", "down", "depth"), [("x", [0, 1, 0], [0, 0, 1]), ("y", [1, 0, 0], [0, 0, -1])])
+def test_upright_slices_turn_by_a_quarter(rotations, grain, down, depth):
+    """What runs across the grain in them runs down, into the depth, or between the two."""
+    settings = preset("fast", grain=grain, upright=True, batch=64, rotations=rotations)
+    across = draw_rotations(settings, generator()) @ torch.tensor(down, dtype=torch.float32)
+    shares = across @ torch.tensor([down, depth], dtype=torch.float32).T
+    torch.testing.assert_close(shares.square().sum(1), torch.ones(64))
+    assert shares.min() > -1e-6
+    assert (shares.max(0).values > 0.9).all()
+
+
 def test_a_quarter_turn_about_x_takes_y_to_z():
     turned = about_axis(0, torch.tensor([np.pi / 2], dtype=torch.float32))[0] @ torch.tensor([0.0, 1.0, 0.0])
     torch.testing.assert_close(turned, torch.tensor([0.0, 0.0, 1.0]), atol=1e-6, rtol=0)

@@ -22,6 +22,7 @@ from solidgrain.runtime.bundle import embedded_folder
 from solidgrain.train import quality
 from solidgrain.train.copying import Copying
 from solidgrain.train.quality import Evaluation, disjoint_crops, distinct, evaluate, spread_out
+from solidgrain.train.slices import Planes
 from tests.bench import cells
 from tests.train.conftest import blotches
 
@@ -88,7 +89,7 @@ def test_a_grained_exemplar_that_is_lit_from_one_side_is_far_from_itself_mirrore
     def mirrored(ridges):
         exemplar = (blotches(160, 160) + ridges[..., None].astype(np.float32)) / 2
         exemplar = exemplar if grain == "x" else exemplar.transpose(1, 0, 2).copy()
-        evaluation = evaluate(exemplar, lambda points, seed: np.resize(exemplar, (len(points), 3)), 1, grain)
+        evaluation = evaluate(exemplar, lambda points, seed: np.resize(exemplar, (len(points), 3)), 1, Planes(grain))
         assert evaluation.turn == "mirrored across its grain"
         return evaluation.turned["vgg_frechet"]
 
@@ -111,10 +112,26 @@ def test_a_grain_limits_the_orientations(monkeypatch):
         seen.append(points.reshape(size, size, 3))
         return resampled(points, seed)
 
-    evaluate(EXEMPLAR, sample, slices=3, grain="x")
+    evaluate(EXEMPLAR, sample, slices=3, planes=Planes("x"))
     for points in seen:
         along = points[:, 1:] - points[:, :-1]
         np.testing.assert_allclose(along, np.broadcast_to([1.0, 0, 0], along.shape), atol=1e-4)
+
+
+def test_what_is_upright_is_measured_upright():
+    """Down in a slice is down, or into the depth, or between the two: it is never up."""
+    downwards = []
+
+    def sample(points, seed):
+        size = round(len(points) ** 0.5)
+        points = points.reshape(size, size, 3)
+        downwards.append(points[1, 0] - points[0, 0])
+        return resampled(points.reshape(-1, 3), seed)
+
+    evaluation = evaluate(EXEMPLAR, sample, slices=8, planes=Planes("x", upright=True))
+    assert (evaluation.grain, evaluation.upright) == ("x", True)
+    assert np.min(downwards) > -1e-4
+    assert np.ptp([step[1] for step in downwards]) > 0.5
 
 
 def test_the_command_measures_a_bundle_and_writes_its_card(solidgrain, toy_folder, tmp_path):
@@ -221,9 +238,23 @@ def test_the_command_refuses_what_it_cannot_measure(solidgrain, toy_folder, tmp_
 
 
 def test_an_exemplar_that_changes_across_itself_is_said_to():
-    copying = Copying(256, 0.1, 1.0, 0.01)
-    even, uneven = (make_figures(Evaluation(64, 1, {}, {}, {}, {}, value), copying).after for value in (0.2, 0.34))
+    even, uneven = (said_after(nonstationarity=value) for value in (0.2, 0.34))
     assert uneven == f"{even} The exemplar changes across itself (nonstationarity 0.34, above 0.3)."
+
+
+def test_flags_for_an_exemplar_with_a_direction_are_named_where_slices_lack_it():
+    lit = {"slices": 4.0, "turned": 16.66}
+    assert "16.7 times its floor when mirrored across its grain" in said_after(grain="x", **lit)
+    assert "train with --upright for" in said_after(grain="x", **lit)
+    assert "train with --anisotropic, and --upright if light" in said_after(**lit)
+    assert said_after(grain="x", upright=True, **lit) == said_after(slices=4.0) == said_after(turned=16.66) == said_after()
+
+
+def said_after(slices=1.0, turned=1.0, **facts):
+    """What follows the table of an evaluation that found such distances."""
+    found = {"vgg_frechet": (slices, 0.1)}
+    evaluation = Evaluation(64, 1, {"vgg_frechet": 1.0}, found, found, {"vgg_frechet": turned}, **facts)
+    return make_figures(evaluation, Copying(256, 0.1, 1.0, 0.01)).after
 
 
 def test_crops_of_a_large_exemplar_are_all_over_it():

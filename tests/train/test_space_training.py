@@ -252,8 +252,9 @@ def test_a_space_has_budgets_and_settings_of_its_own(solidgrain, tmp_path, monke
     monkeypatch.setattr(loop, "train", lambda *_: loop.Ending(0, saved=False, stopped=False))
     folder = photographs(tmp_path / "stones", 2)
     for name, iterations, span in (("fast", 30_000, 7.0), ("paper", 300_000, 15.5)):
-        solidgrain("train", "--space", folder, "--out", tmp_path / name, "--preset", name, "--anisotropic", "x")
+        solidgrain("train", "--space", folder, "--out", tmp_path / name, "--preset", name, "--anisotropic", "x", "--upright")
         run = open_space_run(tmp_path / name)
+        assert run.settings.upright
         assert run.budget == Budget(iterations=iterations)
         assert (run.settings.octaves, run.settings.octave_span, run.settings.grain) == (32, span, "x")
 

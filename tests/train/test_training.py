@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from solidgrain.export.evaluation import scale_of
+from solidgrain.export.evaluation import planes_of, scale_of
 from solidgrain.export.from_run import check_agreement, export_run, sampler_weights
 from solidgrain.runtime import BundleError, TrainingError, load
 from solidgrain.runtime.bundle import open_bundle
@@ -32,6 +32,7 @@ from solidgrain.train.precision import use_bfloat16
 from solidgrain.train.run import Source, create_run, held, open_run, pixels_sha256
 from solidgrain.train.sampler import Sampler
 from solidgrain.train.settings import Budget, preset
+from solidgrain.train.slices import Planes
 from solidgrain.train.streams import stream
 from solidgrain.train.task import SingleExemplar, make_task
 from tests.train.conftest import blotches
@@ -447,6 +448,7 @@ def test_a_photograph_can_be_reduced_and_its_bundle_remembers_by_how_much(solidg
         (["--batch", "0"], 2, "--batch"),
         (["--preset", "slow"], 2, "--preset"),
         (["--anisotropic", "z"], 2, "--anisotropic"),
+        (["--upright"], 2, "--upright: slices that stay upright turn about one axis; add --anisotropic"),
     ],
 )
 def test_flags_that_make_no_sense_are_refused_in_one_line(solidgrain, tmp_path, photograph, flags, code, message):
@@ -454,6 +456,14 @@ def test_flags_that_make_no_sense_are_refused_in_one_line(solidgrain, tmp_path, 
     assert outcome.code == code
     assert message in outcome.error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_was_trained_upright_says_so_and_is_measured_so(solidgrain, tmp_path, photograph):
+    flags = ["--anisotropic", "y", "--upright", "--patch", 32, "--batch", 1, "--iterations", 1]
+    assert solidgrain("train", photograph, "--out", tmp_path / "run", *flags).code == 0
+    assert solidgrain("export", tmp_path / "run", "--out", tmp_path / "bundle").code == 0
+    assert planes_of(open_bundle(tmp_path / "bundle")) == Planes("y", upright=True)
+    assert "turned about the y axis only, upright, from xy to zy" in (tmp_path / "bundle" / "card.md").read_text()
 
 
 def test_the_photographs_of_a_space_are_not_reduced(solidgrain, tmp_path):

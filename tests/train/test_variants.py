@@ -22,7 +22,7 @@ from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.run import Source, create_run, open_run
 from solidgrain.train.sampler import NoiseAtInputSampler, Sampler, make_sampler
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings, from_json, preset, to_json
-from solidgrain.train.slices import draw_rotations, draw_slices, upright
+from solidgrain.train.slices import Planes, draw_rotations, draw_slices
 from solidgrain.train.space_run import open_space_run
 from solidgrain.train.variants import CHANGES, canonical, vary
 from solidgrain.train.vgg import Vgg
@@ -121,7 +121,7 @@ def test_slices_along_the_axes_keep_the_grain_in_the_image(grain, along, step):
     settings = vary(preset("fast", batch=16, patch=32, grain=grain), "henzler")
     moved = draw_slices(settings, generator()).reshape(16, 32, 32, 3).diff(dim=along) * 64
     torch.testing.assert_close(moved, torch.tensor(step, dtype=torch.float32).expand_as(moved), atol=1e-4, rtol=0)
-    assert len(upright(grain, CPU)) == 2
+    assert len(Planes(grain).along_axes()) == 2
 
 
 def test_the_method_s_features_are_the_critic_itself():
