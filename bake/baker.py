@@ -44,7 +44,7 @@ class Baked:
 
 
 @dataclass(frozen=True)
-class Job:
+class Target:
     """One output while it is baked."""
 
     output: Output
@@ -75,58 +75,58 @@ def bake(
     first, stop = shard or (0, plan.size[2])
     if first == stop:
         return Baked([], 0.0)  # there are more shards than slabs
-    with _jobs(plan, workers, shard, keep=resume or shard is not None) as jobs:
-        finished = _finished(jobs)
+    with _targets(plan, workers, shard, keep=resume or shard is not None) as targets:
+        finished = _finished(targets)
         reused = stop - first
         if finished is None:
-            for job in jobs:
-                job.staging.restore()
-            reused = min(sum(slices for z, slices in job.done.items() if first <= z < stop) for job in jobs)
-            evaluation = _feed(plan, texture, jobs, workers, (first, stop), on_slice)
-        files = [] if shard else _put_in_place(plan, jobs, finished or _finish(jobs))
+            for target in targets:
+                target.staging.restore()
+            reused = min(sum(slices for z, slices in target.done.items() if first <= z < stop) for target in targets)
+            evaluation = _feed(plan, texture, targets, workers, (first, stop), on_slice)
+        files = [] if shard else _put_in_place(plan, targets, finished or _finish(targets))
     return Baked(files, time.monotonic() - started, evaluation, reused)
 
 
 def merge(plan: Plan, workers: Workers) -> Baked:
     """Complete a plan whose shards have all been baked. Raises BakeError that names the slices that are missing."""
     started = time.monotonic()
-    with _jobs(plan, workers, None, keep=True) as jobs:
-        finished = _finished(jobs)
+    with _targets(plan, workers, None, keep=True) as targets:
+        finished = _finished(targets)
         if finished is None:
-            for job in jobs:
-                job.staging.restore()
-                if gaps := job.staging.missing():
+            for target in targets:
+                target.staging.restore()
+                if gaps := target.staging.missing():
                     runs = ", ".join(f"{first} to {stop - 1}" for first, stop in gaps)
-                    raise BakeError(f"{job.output.path}: slices {runs} are missing or damaged; bake their shards first")
-        files = _put_in_place(plan, jobs, finished or _finish(jobs))
+                    raise BakeError(f"{target.output.path}: slices {runs} are missing or damaged; bake their shards first")
+        files = _put_in_place(plan, targets, finished or _finish(targets))
     return Baked(files, time.monotonic() - started, reused_slices=plan.size[2])
 
 
 @contextmanager
-def _jobs(plan: Plan, workers: Workers, shard: Shard | None, keep: bool) -> Iterator[list[Job]]:
+def _targets(plan: Plan, workers: Workers, shard: Shard | None, keep: bool) -> Iterator[list[Target]]:
     """The outputs of a plan, each with its locked staging; what is there and what an error leaves is kept, or forgotten.
 
     An OSError becomes a BakeError that names the file.
     """
-    jobs: list[Job] = []
+    targets: list[Target] = []
     try:
         for output in plan.outputs:
             writer = open_writer(output, plan.volume, workers)
             staging = open_staging(output.path, plan.work(output), plan.size[2], writer.reserved, shard, fresh=not keep)
-            jobs.append(Job(output, writer, staging))
+            targets.append(Target(output, writer, staging))
             staging.keep_plan(plan)
-        yield jobs
+        yield targets
     except BaseException as error:
-        for job in jobs:
-            if not keep and not job.staging.in_place:
-                job.staging.clear()
+        for target in targets:
+            if not keep and not target.staging.in_place:
+                target.staging.clear()
         if isinstance(error, OSError):
             culprit = _culprit(error, plan)
             raise BakeError(f"cannot write {culprit}: {error.strerror}; free space or bake elsewhere") from error
         raise
     finally:
-        for job in jobs:
-            job.staging.close()
+        for target in targets:
+            target.staging.close()
 
 
 def _culprit(error: OSError, plan: Plan) -> str:
@@ -134,51 +134,53 @@ def _culprit(error: OSError, plan: Plan) -> str:
     return str(error.filename2 or error.filename or ", ".join(str(output.path) for output in plan.outputs))
 
 
-def _finished(jobs: Sequence[Job]) -> list[Notes] | None:
+def _finished(targets: Sequence[Target]) -> list[Notes] | None:
     """The complete files of all outputs, if an earlier bake came so far."""
-    notes = [job.staging.finished() for job in jobs]
+    notes = [target.staging.finished() for target in targets]
     found = [lines for lines in notes if lines is not None]
-    return found if jobs and len(found) == len(notes) else None
+    return found if targets and len(found) == len(notes) else None
 
 
-def _finish(jobs: Sequence[Job]) -> list[Notes]:
+def _finish(targets: Sequence[Target]) -> list[Notes]:
     """Assemble the files of all outputs. From here on, a killed bake has only to put them in place."""
-    return [job.staging.finish(job.writer.assemble(job.staging)) for job in jobs]
+    return [target.staging.finish(target.writer.assemble(target.staging)) for target in targets]
 
 
-def _put_in_place(plan: Plan, jobs: Sequence[Job], finished: Sequence[Notes]) -> list[Path]:
+def _put_in_place(plan: Plan, targets: Sequence[Target], finished: Sequence[Notes]) -> list[Path]:
     """Give all files their names. An interrupt waits; an error or a kill leaves the stagings for `resume`."""
     files: list[Path] = []
     with uninterrupted():
-        for job, lines in zip(jobs, finished, strict=True):
-            stage_manifest(plan, job.output, lines, job.staging.folder)  # all that needs space comes before the first name
-        for job in jobs:
-            job.staging.in_place = True
-        for job, lines in zip(jobs, finished, strict=True):
-            replaced = forget_manifest(job.output)
-            files += job.staging.commit(lines)
-            place_manifest(job.output, job.staging.folder)
-            remove_stale(replaced, job.output, lines)
-            job.staging.clear()
+        for target, lines in zip(targets, finished, strict=True):
+            stage_manifest(
+                plan, target.output, lines, target.staging.folder
+            )  # all that needs space comes before the first name
+        for target in targets:
+            target.staging.in_place = True
+        for target, lines in zip(targets, finished, strict=True):
+            replaced = forget_manifest(target.output)
+            files += target.staging.commit(lines)
+            place_manifest(target.output, target.staging.folder)
+            remove_stale(replaced, target.output, lines)
+            target.staging.clear()
     return files
 
 
-def _feed(plan: Plan, texture: Texture, jobs: Sequence[Job], workers: Workers, shard: Shard, on_slice: OnSlice) -> float:
+def _feed(plan: Plan, texture: Texture, targets: Sequence[Target], workers: Workers, shard: Shard, on_slice: OnSlice) -> float:
     """The slabs that any output lacks, to those that lack them: they are written while the next is evaluated.
 
     Returns the seconds spent in the sampler. `workers` are the writers': they are cancelled if anything goes wrong.
     """
     evaluation = 0.0
     writing: deque[Future[None]] = deque()
-    done = [job.done for job in jobs]
+    done = [target.done for target in targets]
     wanted = [z for z in range(*shard, plan.slab) if any(z not in slabs for slabs in done)]
     total, left = shard[1] - shard[0], sum(min(plan.slab, shard[1] - z) for z in wanted)
 
     def write(z: int, slab: FloatArray) -> None:
         nonlocal left
-        for job, slabs in zip(jobs, done, strict=True):
+        for target, slabs in zip(targets, done, strict=True):
             if z not in slabs:
-                job.staging.append(z, len(slab), job.writer.encode(z, slab))
+                target.staging.append(z, len(slab), target.writer.encode(z, slab))
         left -= len(slab)
         on_slice(total - left, total)
 
