@@ -131,7 +131,7 @@ class Run(RunFolder):
     def settings_at(self, iteration: int) -> Settings:
         """The settings of one iteration: later patches are larger, where the exemplar has room for them."""
         settings = self.settings
-        fits = 0 < 2 * settings.later_patch <= min(self.exemplar.shape[:2])
+        fits = 0 < settings.later_room * settings.later_patch <= min(self.exemplar.shape[:2])
         return replace(settings, patch=settings.later_patch) if fits and iteration >= settings.later_from else settings
 
 

@@ -35,7 +35,8 @@ class Settings:
 
     # Slices (Sec. 4, implementation details)
     patch: int = 64  # pixels along each side of a patch
-    later_patch: int = 0  # the same from iteration `later_from` on, if the exemplar is twice as large; 0: as before
+    later_patch: int = 0  # the same from iteration `later_from` on; 0: as before
+    later_room: int = 2  # times as large as that must be an exemplar that gets larger patches later
     later_from: int = 800
     batch: int = 4
     transposed: bool = True  # real patches of isotropic materials are also transposed by chance, not only flipped
@@ -122,6 +123,7 @@ FAST = Settings(
     octaves=32,
     sampler_start="stone",
     later_patch=128,
+    later_room=4,
     principal_colors=True,
     shared_noise=True,
     relative_gram=True,

@@ -141,7 +141,7 @@ def test_bfloat16_is_chosen_where_it_is_faster(monkeypatch):
 
 def test_later_patches_are_larger_where_the_exemplar_has_room(tmp_path, photograph):
     """And a run resumes across the change to the same numbers."""
-    changes = {"later_patch": 40, "later_from": 4}
+    changes = {"later_patch": 40, "later_from": 4, "later_room": 2}
     whole, halves = (new_run(tmp_path / name, photograph, **changes) for name in ("whole", "halves"))
     assert min(whole.exemplar.shape[:2]) == 80
     task, sizes = make_task(whole, CPU), []
@@ -154,8 +154,9 @@ def test_later_patches_are_larger_where_the_exemplar_has_room(tmp_path, photogra
     train(halves, Budget(iterations=3), CPU)
     train(halves, Budget(iterations=6), CPU)
     assert losses(whole.folder) == losses(halves.folder)
-    small = new_run(tmp_path / "small", photograph, later_patch=41, later_from=0)
-    assert small.settings_at(9).patch == 32
+    for name, patch, room in (("large", 41, 2), ("many", 27, 3)):
+        small = new_run(tmp_path / name, photograph, later_patch=patch, later_from=0, later_room=room)
+        assert small.settings_at(9).patch == 32
     card = (export_run(whole.folder, tmp_path / "bundle") / "card.md").read_text()
     assert "2 of 32², 40² from iteration 4 on, pixels per iteration" in card
 
