@@ -150,10 +150,8 @@ def _put_in_place(plan: Plan, targets: Sequence[Target], finished: Sequence[Note
     """Give all files their names. An interrupt waits; an error or a kill leaves the stagings for `resume`."""
     files: list[Path] = []
     with uninterrupted():
-        for target, lines in zip(targets, finished, strict=True):
-            stage_manifest(
-                plan, target.output, lines, target.staging.folder
-            )  # all that needs space comes before the first name
+        for target, lines in zip(targets, finished, strict=True):  # all that needs space comes before the first name
+            stage_manifest(plan, target.output, lines, target.staging.folder)
         for target in targets:
             target.staging.in_place = True
         for target, lines in zip(targets, finished, strict=True):
