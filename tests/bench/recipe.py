@@ -81,6 +81,7 @@ ROWS: dict[str, tuple[str, Settings]] = {
     "alpha": ("alpha 0.1", as_paper("alpha")),
     "alpha-falls": ("alpha stays", as_paper("alpha_half_life")),
     "later-patch": ("patches of 64² all along", as_paper("later_patch")),
+    "later-room": ("patches of 128² later from 256² on", as_paper("later_room")),
     "patch": ("patches of 128² all along", as_paper("patch", "later_patch")),
     "batch": ("batches of 16", as_paper("batch")),
     "rotations": ("Euler angles from [0°, 90°]", as_paper("rotations")),
