@@ -183,7 +183,7 @@ def check_dither(arguments: argparse.Namespace, outputs: Sequence[Output]) -> No
     """Refuse `--dither` where no output's type rounds. Raises UsageError."""
     from solidgrain.bake.writers import rounds
 
-    if arguments.dither and outputs and not any(map(rounds, outputs)):
+    if arguments.dither and not any(map(rounds, outputs)):
         raise UsageError("--dither: no --out of whole numbers, of the types asked for; leave it out")
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-import torch
 
 from docs.carving import SHAPES, Distance, draw
 from docs.embedded import EXEMPLARS, HERE, embedded_textures, exemplar_of, find_photograph, say
@@ -23,11 +22,10 @@ from solidgrain.export.evaluation import planes_of
 from solidgrain.export.sheet import GAP, Page, Pixels
 from solidgrain.runtime import SolidgrainError, Texture, load_texture
 from solidgrain.train.exemplar import FloatArray
-from solidgrain.train.slices import about_axis
+from solidgrain.train.slices import Planes
 
 SIDE = 128  # exemplar pixels along each side of a panel
 LARGE, SMALL = 3, 2  # screen pixels per exemplar pixel, of granite.jpg and of the gallery
-TURN = 0.9  # radians: of oriented textures' oblique slices about the grain
 MOST = 1_000_000  # bytes of the gallery
 QUALITIES = range(92, 40, -4)
 SEED = 7
@@ -83,7 +81,7 @@ def oblique_rotation(grain: str) -> np.ndarray:
     """
     if grain == "none":
         return np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
-    return about_axis("xyz".index(grain), torch.tensor([TURN]))[0].numpy()
+    return Planes(grain).example().numpy()
 
 
 def plane(texture: Texture, rotation: np.ndarray) -> FloatArray:

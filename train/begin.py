@@ -108,7 +108,7 @@ def start(arguments: argparse.Namespace) -> Run:
         warn(f"{arguments.exemplar}: {warning}")
     for line in misgivings.of_photograph(arguments.exemplar, exemplar):
         warn(line)
-    settings = with_grain(settings, arguments.anisotropic, exemplar, bool(arguments.upright))
+    settings = with_grain(settings, arguments.anisotropic, exemplar)
     of_photograph = "" if scale == 1 else pixels_sha256(photograph)
     source = Source(arguments.exemplar.name, arguments.license or "", arguments.credit or "", colorspace, scale, of_photograph)
     return create_run(arguments.out, settings, exemplar, source, make_budget(arguments, settings))
@@ -124,7 +124,7 @@ def start_space(arguments: argparse.Namespace) -> RunFolder:
     if arguments.anisotropic == "auto":
         raise UsageError("--anisotropic: say x or y; the grain of all photographs of a --space must run the same way")
     if arguments.anisotropic:
-        settings = replace(settings, grain=arguments.anisotropic, upright=bool(arguments.upright))
+        settings = replace(settings, grain=arguments.anisotropic)
 
     smallest = max(settings.patch, settings.encoded_patch)
     members = read_members(arguments.space, smallest, bool(arguments.skip_unreadable), warn)
@@ -138,7 +138,7 @@ def make_settings(arguments: argparse.Namespace) -> Settings:
     """The preset, with what the flags change. Raises UsageError for a patch that is too small, SolidgrainError without VGG."""
     if arguments.upright and not arguments.anisotropic:
         raise UsageError("--upright: slices that stay upright turn about one axis; add --anisotropic")
-    changes = {name: getattr(arguments, name) for name in ("patch", "batch", "seed", "precision")}
+    changes = {name: getattr(arguments, name) for name in ("patch", "batch", "seed", "precision", "upright")}
     changes = {name: value for name, value in changes.items() if value is not None}
     if "patch" in changes:
         changes["later_patch"] = 0  # what was asked for, all along
@@ -153,14 +153,14 @@ def make_settings(arguments: argparse.Namespace) -> Settings:
     return settings
 
 
-def with_grain(settings: Settings, anisotropic: str | None, exemplar: FloatArray, upright: bool = False) -> Settings:
+def with_grain(settings: Settings, anisotropic: str | None, exemplar: FloatArray) -> Settings:
     """The settings for an oriented material: the axis about which slices turn, and how long its structures start."""
     if anisotropic is None:
         return settings
     grain = measure_grain(exemplar)
     axis: Literal["x", "y"] = grain.axis if anisotropic == "auto" else "x" if anisotropic == "x" else "y"
     ratio = grain.ratio if settings.preset == "fast" and axis == grain.axis else 1.0
-    return replace(settings, grain=axis, grain_ratio=ratio, upright=upright)
+    return replace(settings, grain=axis, grain_ratio=ratio)
 
 
 def make_budget(arguments: argparse.Namespace, settings: Settings) -> Budget:

@@ -18,13 +18,12 @@ from solidgrain.runtime.files import replacing
 from solidgrain.train.exemplar import FloatArray, middle
 from solidgrain.train.noise import draw_noise
 from solidgrain.train.settings import Settings
-from solidgrain.train.slices import about_axis, flat_slice, from_quaternions
+from solidgrain.train.slices import Planes, flat_slice
 
 Model = Callable[..., Tensor]  # noise, points and what else it needs -> colours
 Pixels = npt.NDArray[np.uint8]  # [H, W, 3]
 
 SIZE = 256  # pixels along each side of a slice
-TURN = 0.9  # radians, about a grain
 
 
 @torch.no_grad()
@@ -35,10 +34,7 @@ def render_slices(model: Model, settings: Settings, device: torch.device, *condi
     """
     generator = torch.Generator(device).manual_seed(7)
     noise = draw_noise(settings.octaves, settings.resolution, generator)
-    if settings.grain == "none":
-        oblique = from_quaternions(torch.tensor([[0.5, 0.1, 0.7, 0.5]], device=device))[0]
-    else:  # no loss ever sees a plane across the grain
-        oblique = about_axis("xyz".index(settings.grain), torch.tensor([TURN], device=device))[0]
+    oblique = Planes(settings.grain, settings.upright).example().to(device)
     flat = flat_slice(SIZE, device)
     slices = [model(noise, points[None], *conditions).reshape(SIZE, SIZE, 3) for points in (flat, flat @ oblique.T)]
     image: FloatArray = torch.cat(slices, 1).clamp(0, 1).cpu().numpy()

@@ -40,6 +40,12 @@ class Planes(NamedTuple):
         angles = (0.5 if self.upright else 2.0) * math.pi * torch.rand(count, generator=generator, device=device)
         return about_axis("xyz".index(self.grain), angles)
 
+    def example(self) -> Tensor:
+        """One of them to look at, the same every time and along no axes, as a rotation [3, 3] of xy."""
+        if self.grain == "none":
+            return from_quaternions(torch.tensor([[0.5, 0.1, 0.7, 0.5]]))[0]
+        return about_axis("xyz".index(self.grain), torch.tensor([0.9]))[0]
+
 
 ALL_PLANES = Planes()
 

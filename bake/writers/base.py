@@ -77,9 +77,9 @@ class Output:
         return str(self.options["colorspace"])
 
 
-def slab_slices(depth: int, slice_bytes: int, slab_bytes: int | None = None) -> int:
-    """Slices of `slice_bytes` that are worked on at a time: as many as fit `slab_bytes` (`SLAB_BYTES`), at least one."""
-    return max(1, min(THICKEST_SLAB, depth, (slab_bytes or SLAB_BYTES) // slice_bytes))
+def slab_slices(depth: int, slice_bytes: int) -> int:
+    """Slices of `slice_bytes` that are worked on at a time: as many as fit `SLAB_BYTES`, at least one."""
+    return max(1, min(THICKEST_SLAB, depth, SLAB_BYTES // slice_bytes))
 
 
 class Option(NamedTuple):

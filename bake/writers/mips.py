@@ -20,7 +20,7 @@ import numpy.typing as npt
 from solidgrain.bake.color import to_linear, to_srgb
 from solidgrain.bake.frames import PATTERN
 from solidgrain.bake.store import Encoded, Finished, Store
-from solidgrain.bake.writers.base import SLAB_BYTES, FloatArray, Output, Volume, Writer, slab_slices
+from solidgrain.bake.writers.base import FloatArray, Output, Volume, Writer, slab_slices
 from solidgrain.runtime.workers import Workers
 
 FILTERS = ("box", "kaiser")
@@ -162,7 +162,7 @@ class MippedWriter(Writer):
             content = source.read(REDUCED, z, 1, height * width * 12)
             return np.frombuffer(content, np.float32).reshape(height, width, 3)
 
-        thickness = slab_slices(len(by.source), height * width * 12, SLAB_BYTES // 2)  # beside what it is made of
+        thickness = slab_slices(len(by.source), 2 * height * width * 12)  # beside what they are made of
         for first in range(0, len(by.source), thickness):
             slab, last = [], first + thickness
             for index, weight in zip(by.source[first:last], by.weight[first:last], strict=True):

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from solidgrain.runtime.files import replacing
 from solidgrain.train.begin import with_grain
-from solidgrain.train.cuts import Sample, as_image
+from solidgrain.train.cuts import Sample, as_image, oblique_rotation
 from solidgrain.train.exemplar import FloatArray
 from solidgrain.train.inception import Inception
 from solidgrain.train.quality import Measure, compared, floor_between
@@ -88,7 +88,7 @@ def unseen(name: str, generator: torch.Generator) -> Tensor:
     """A random orientation of those that are fair for the solid."""
     if name == "wood":
         return about_axis(0, TILT * (2 * torch.rand(1, generator=generator) - 1))[0]
-    return ALL_PLANES.turned(1, generator)[0]
+    return oblique_rotation(generator, ALL_PLANES)
 
 
 KINDS = {"seen": seen, "unseen": unseen}

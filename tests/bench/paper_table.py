@@ -28,7 +28,7 @@ from solidgrain.train.inception import Inception
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import evaluate
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings
-from solidgrain.train.slices import Planes, from_quaternions
+from solidgrain.train.slices import Planes
 from solidgrain.train.variants import vary
 from tests.bench import cells
 
@@ -103,7 +103,6 @@ def finish_cell(
 ) -> None:
     """Train and measure one method on one exemplar, unless that was done before."""
     settings = with_grain(COLUMNS[column], "auto" if folder.name == "wood" else None, exemplar)
-
     planes = Planes(settings.grain, settings.upright)
 
     def measured(sample: Sample) -> dict[str, Any]:
@@ -116,8 +115,7 @@ def finish_cell(
 
 def slice_picture(sample: Sample, planes: Planes, size: int = 256) -> FloatArray:
     """An oblique slice of instance 0, or one that holds the grain."""
-    free = planes.grain == "none"
-    oblique = from_quaternions(torch.tensor([[0.5, 0.1, 0.7, 0.5]]))[0] if free else planes.along_axes()[0]
+    oblique = planes.example() if planes.grain == "none" else planes.along_axes()[0]
     picture: FloatArray = sample(cells.plane(size, oblique, np.zeros(3)), 0).reshape(size, size, 3)
     return picture
 

@@ -106,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         for row in arguments.only or ROWS:
             for name, exemplar in (exemplars | grained).items():
                 settings = replace(ROWS[row][1], seed=seed, **changes)
-                settings = with_grain(settings, "auto" if name in grained else None, exemplar, settings.upright)
+                settings = with_grain(settings, "auto" if name in grained else None, exemplar)
                 folder = arguments.out / row / f"{name}-{seed}"
                 for mark in arguments.marks:
                     finish_mark(folder, settings, exemplar, mark, arguments.by, arguments.slices, device, inception)
@@ -173,7 +173,6 @@ def finish_mark(
     """Train one row on one exemplar until a mark, and measure, unless that was done before."""
     result = folder.with_name(f"{folder.name}-{mark:g}.json")
     budget = Budget(minutes=mark) if by == "minutes" else Budget(iterations=round(mark))
-
     planes = Planes(settings.grain, settings.upright)
 
     def measured(sample: Sample) -> dict[str, Any]:
