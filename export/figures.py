@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from solidgrain.train.exemplar import NONSTATIONARY
+from solidgrain.train.exemplar import MIRRORED, NONSTATIONARY
 
 if TYPE_CHECKING:
     from solidgrain.train.copying import Copying
@@ -48,6 +48,9 @@ def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
     if evaluation.nonstationarity > NONSTATIONARY:
         figure = f"{evaluation.nonstationarity:.2f}, above {NONSTATIONARY}"
         after.append(f"The exemplar changes across itself (nonstationarity {figure}).")
+    if evaluation.symmetry > MIRRORED:
+        figure = f"{evaluation.symmetry:.2f}, above {MIRRORED}"
+        after.append(f"The exemplar is its own mirror image (symmetry about its middle {figure}): one side of it was compared.")
     return Figures(
         f"Distances to the exemplar over its own floor, mean ± standard deviation over {evaluation.slices} slices of "
         f"{evaluation.crop}² pixels, through the runtime:",

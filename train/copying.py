@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from solidgrain.train.cuts import Sample, as_image, axis_rotation, cut, oblique_rotation, random_place
-from solidgrain.train.exemplar import FloatArray
+from solidgrain.train.exemplar import FloatArray, unfolded
 from solidgrain.train.slices import ALL_PLANES, Planes
 
 SIDE = 15  # pixels along each side of a patch
@@ -55,12 +55,13 @@ class Pair(NamedTuple):
 def measure_copying(exemplar: FloatArray, sample: Sample, planes: Planes = ALL_PLANES) -> tuple[Copying, list[Pair]]:
     """Compare patches of a texture with their nearest in the exemplar, and return the nearest pairs of all as well.
 
-    The search is exhaustive: every place in the exemplar, in each orientation in which training may have shown it.
+    The search is exhaustive: every place in the exemplar, in each orientation in which training may have shown it. The
+    floor of what was mirrored to tile is that of one side: its halves hold the same.
     """
-    image = as_image(exemplar)
+    image, side = as_image(exemplar), as_image(unfolded(exemplar, 2 * SIDE))
     count = min(MOST, max(FEWEST, MOST * 2**18 // (image.shape[2] * image.shape[3]))) // SLICES * SLICES
     found, nearest = search(image, made := _synthesised(sample, count, planes), planes.grain)
-    first, second = image.tensor_split(2, dim=2 if image.shape[2] > image.shape[3] else 3)
+    first, second = side.tensor_split(2, dim=2 if side.shape[2] > side.shape[3] else 3)
     generator = torch.Generator().manual_seed(2)
     halves = [(first, _patches(second, count // 2, generator)), (second, _patches(first, count // 2, generator))]
     floor = torch.cat([search(half, patches, planes.grain)[0] for half, patches in halves])

@@ -17,6 +17,8 @@ CORRELATED = 2048  # pixels along each side, of which the autocorrelation is tak
 NONSTATIONARY = 0.3  # above it, one texture cannot describe the image (docs/training.md)
 INWARDS = 10  # steps that an edge's own is held against
 FRAMED = 3.0  # `edge_step` above which an image has a frame: photographs of stones without one come to 2.5 at most
+OFF = 3  # pixels by which cropping may have moved the middle about which an image was mirrored
+MIRRORED = 0.6  # `mirror_symmetry` above which an image was mirrored to tile (docs/training.md)
 
 
 def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:
@@ -68,6 +70,31 @@ def edge_step(exemplar: FloatArray) -> float:
             following = np.lib.stride_tricks.sliding_window_view(ordered[1:], INWARDS).max(1)[:near]
             largest = max(largest, float((ordered[:near] / np.maximum(following, 1e-3)).max()))
     return largest
+
+
+def mirror_symmetry(exemplar: FloatArray) -> float:
+    """How nearly the exemplar is its own mirror image about one of its middles: 1 where it was mirrored to tile."""
+    return max(_symmetry(exemplar, axis) for axis in (0, 1))
+
+
+def unfolded(exemplar: FloatArray, smallest: int) -> FloatArray:
+    """One side of an exemplar that was mirrored about its middle, of at least so many pixels; else all of it.
+
+    About both middles it is one corner, and of a side that was mirrored once more one side again.
+    """
+    for axis in (0, 1):
+        while (side := (exemplar.shape[axis] - OFF) // 2) >= smallest and _symmetry(exemplar, axis) > MIRRORED:
+            exemplar = exemplar.take(range(side), axis)
+    return exemplar
+
+
+def _symmetry(exemplar: FloatArray, axis: int) -> float:
+    """The correlation of the steps along an axis with the same backwards: what runs along the axis has none."""
+    steps = np.diff(np.moveaxis(middle(exemplar, CORRELATED).mean(-1), axis, 0), axis=0)
+    back, energy = -steps[::-1], max(float((steps**2).sum()), 1e-6)
+    ahead = [float((steps[off:] * back[: len(back) - off]).sum()) for off in range(OFF + 1)]
+    behind = [float((steps[: len(steps) - off] * back[off:]).sum()) for off in range(1, OFF + 1)]
+    return max(ahead + behind) / energy
 
 
 def middle(exemplar: FloatArray, largest: int) -> FloatArray:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from solidgrain.runtime.bundle import embedded_folder, open_bundle
 from solidgrain.train.collection import in_levels
-from solidgrain.train.exemplar import FRAMED, NONSTATIONARY, FloatArray, edge_step, nonstationarity
+from solidgrain.train.exemplar import FRAMED, MIRRORED, NONSTATIONARY, FloatArray, edge_step, mirror_symmetry, nonstationarity
 from solidgrain.train.run import Run, pixels_sha256
 from solidgrain.train.space_run import SpaceRun, open_any
 
@@ -42,6 +42,14 @@ MISGIVINGS = (
         "seem to have a frame",
         "edge step",
         "crop it off, or it is learned, too",
+    ),
+    Misgiving(
+        mirror_symmetry,
+        MIRRORED,
+        "is its own mirror image",
+        "are their own mirror images",
+        "symmetry about its middle",
+        "crop to one side of it, or the folds are learned, too",
     ),
 )
 

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from solidgrain.runtime.errors import ExemplarError
 from solidgrain.train.cuts import RotationOf, Sample, as_image, axis_rotation, oblique_rotation, take_slices
-from solidgrain.train.exemplar import FloatArray, nonstationarity
+from solidgrain.train.exemplar import FloatArray, mirror_symmetry, nonstationarity, unfolded
 from solidgrain.train.inception import Inception
 from solidgrain.train.losses import gram_difference, gram_matrices
 from solidgrain.train.slices import ALL_PLANES, Planes
@@ -54,6 +54,7 @@ class Evaluation:
     oblique: dict[str, tuple[float, float]]
     turned: Measures  # the exemplar itself, as `turn` says: far above 1 where it has a direction
     nonstationarity: float = 0.0  # of the exemplar
+    symmetry: float = 0.0  # of the exemplar about its middle: above `MIRRORED`, one side of it stands for all
     grain: str = "none"  # the image axis about which slices turn
     upright: bool = False  # by a quarter at most
     among: Measures = field(default_factory=dict)  # each oblique slice from the next: at 1 they vary as the exemplar's parts do
@@ -69,11 +70,12 @@ def evaluate(
 ) -> Evaluation:
     """Measure axis-aligned and oblique slices of a texture, one of each per seed, against its exemplar.
 
-    Slices are taken in those planes alone that training saw.
+    Slices are taken in those planes alone that training saw. Of an exemplar that was mirrored to tile one side is compared, for
+    a floor is not between mirror images.
     Raises ExemplarError if the exemplar's parts are all the same: there is no floor then.
     """
     measure = Measure(inception)
-    image = as_image(exemplar)
+    image = as_image(unfolded(exemplar, SMALLEST))
     size = min(image.shape[2] // 2, image.shape[3] // 2, LARGEST_CROP)
     squares = [square.pixels for square in spread_out(distinct(disjoint_crops(image, size)), COMPARED)]
     crops = [measure.statistics(square) for square in squares]
@@ -99,6 +101,7 @@ def evaluate(
         oblique=oblique,
         turned={name: turned[name] / floor[name] for name in floor},
         nonstationarity=nonstationarity(exemplar),
+        symmetry=mirror_symmetry(exemplar),
         grain=planes.grain,
         upright=planes.upright,
         among=among,

@@ -51,6 +51,12 @@ def test_a_texture_that_copies_with_a_little_noise_is_caught():
     assert copying.closer == 1
 
 
+def test_of_a_mirrored_exemplar_the_floor_is_that_of_one_side():
+    mirrored = np.concatenate([EXEMPLAR, EXEMPLAR[:, ::-1]], axis=1)
+    assert 0.95 < measure_copying(mirrored, crops_of(REST))[0].ratio < 1.05
+    assert measure_copying(mirrored, crops_of(mirrored))[0].ratio == 0
+
+
 def test_half_a_copy_shows_in_the_share():
     def sample(points, seed):
         return crops_of(EXEMPLAR if seed % 4 < 2 else REST)(points, seed)

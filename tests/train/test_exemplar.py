@@ -12,7 +12,16 @@ import torch
 
 from solidgrain.runtime import ExemplarError
 from solidgrain.train import exemplar
-from solidgrain.train.exemplar import FRAMED, draw_patches, edge_step, measure_grain, nonstationarity
+from solidgrain.train.exemplar import (
+    FRAMED,
+    MIRRORED,
+    draw_patches,
+    edge_step,
+    measure_grain,
+    mirror_symmetry,
+    nonstationarity,
+    unfolded,
+)
 from solidgrain.train.photograph import read_exemplar, read_photograph, scaled
 from solidgrain.train.settings import preset
 from tests.train.conftest import blotches
@@ -239,3 +248,49 @@ def test_a_frame_is_a_step_near_an_edge_that_nothing_beside_it_comes_near(width)
     framed[:, -width:] = 0
     assert edge_step(whole) < 2 < FRAMED < edge_step(framed)
     assert edge_step(np.full((64, 64, 3), 0.5, np.float32)) == 0
+
+
+@pytest.mark.parametrize("cropped", [0, 1, 3])
+def test_a_mirrored_photograph_is_unfolded_to_one_side(cropped):
+    side = blotches(90, 130)
+    assert mirror_symmetry(side) < 0.3
+    assert unfolded(side, 32) is side
+    once = np.concatenate([side, side[:, ::-1]], axis=1)[:, cropped:]
+    twice = np.concatenate([once, once[::-1]], axis=0)[cropped:]
+    for mirrored, shape in ((once, (90, 130 - 2)), (twice, (90 - 2, 130 - 2))):
+        assert mirror_symmetry(mirrored) > 0.9 > MIRRORED
+        found = unfolded(mirrored, 32)
+        np.testing.assert_allclose(found.shape[:2], shape, atol=2)
+        np.testing.assert_array_equal(found, mirrored[: found.shape[0], : found.shape[1]])
+
+
+def test_what_was_mirrored_twice_is_unfolded_twice_but_not_below_the_smallest():
+    side = blotches(80, 80)
+    mirrored = np.concatenate([side, side[:, ::-1]] * 2, axis=1)
+    assert unfolded(mirrored, 64).shape == (80, 77, 3)
+    assert unfolded(mirrored, 90).shape == (80, 158, 3)
+
+
+@pytest.mark.parametrize("rows", [True, False])
+def test_a_grain_is_no_mirror_image(rows):
+    stripes = np.random.default_rng(0).random((96, 1, 1), np.float32) + 0.3 * blotches(96, 96)
+    assert mirror_symmetry(stripes if rows else stripes.transpose(1, 0, 2)) < 0.4
+
+
+def test_of_one_colour_there_is_nothing_to_mirror():
+    plain = np.full((96, 96, 3), 0.5, np.float32)
+    assert mirror_symmetry(plain) == 0
+    assert unfolded(plain, 32) is plain
+
+
+def test_photographs_are_no_mirror_images_and_their_halves_beside_their_own_are(exemplars, tmp_path):
+    """Of stones, woods and rusts, as a JPEG of quality 75: no figure of either is near the limit."""
+    natural, mirrored = {}, {}
+    for photograph in sorted(exemplars.glob("*128/*.png")):
+        pixels = read_exemplar(photograph, 64)
+        half = pixels[:, : pixels.shape[1] // 2]
+        tile = write(tmp_path / "tile.jpg", np.concatenate([half, half[:, ::-1]], axis=1), compression="jpeg:75")
+        natural[photograph.stem], mirrored[photograph.stem] = mirror_symmetry(pixels), mirror_symmetry(read_exemplar(tile, 64))
+    assert len(natural) > 200
+    assert max(natural.values()) < 0.4
+    assert min(mirrored.values()) > 0.7

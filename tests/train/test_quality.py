@@ -242,6 +242,16 @@ def test_an_exemplar_that_changes_across_itself_is_said_to():
     assert uneven == f"{even} The exemplar changes across itself (nonstationarity 0.34, above 0.3)."
 
 
+def test_one_side_of_a_mirrored_exemplar_is_compared():
+    mirrored = np.concatenate([EXEMPLAR, EXEMPLAR[:, ::-1]], axis=1)
+    side = np.ascontiguousarray(mirrored[:, : (mirrored.shape[1] - 3) // 2])
+    whole, part = (evaluate(one, resampled, slices=1) for one in (mirrored, side))
+    assert whole.symmetry > 0.9
+    assert part.symmetry < 0.6
+    assert whole.floor == part.floor
+    assert "is its own mirror image (symmetry about its middle 0.94, above 0.6): one side" in said_after(symmetry=0.94)
+
+
 def test_flags_for_an_exemplar_with_a_direction_are_named_where_slices_lack_it():
     lit = {"slices": 4.0, "turned": 16.66}
     assert "16.7 times its floor when mirrored across its grain" in said_after(grain="x", **lit)

@@ -569,6 +569,14 @@ def test_a_frame_gets_a_warning_that_names_the_figure(solidgrain, tmp_path):
     assert float(said[1]) == pytest.approx(edge_step(framed), abs=0.1)
 
 
+def test_a_mirrored_photograph_gets_a_warning_that_names_the_figure(solidgrain, tmp_path):
+    side = blotches(60, 90)
+    oiio.ImageBuf(np.concatenate([side, side[::-1]])).write(os.fspath(tmp_path / "tile.jpg"), oiio.UINT8)
+    flags = ["--out", tmp_path / "run", "--iterations", 1, "--patch", 32, "--batch", 1]
+    said = solidgrain("train", tmp_path / "tile.jpg", *flags).err
+    assert re.search(r"tile.jpg is its own mirror image \(symmetry about its middle 1.00, above 0.6\); crop to one side", said)
+
+
 def test_a_training_that_leaves_nothing_fails(tmp_path, photograph, solidgrain, monkeypatch):
     new_run(tmp_path / "run", photograph)
     monkeypatch.setattr(Trainer, "flaw", lambda self: "a weight is not finite")
