@@ -17,7 +17,7 @@ def write_card(name: str, training: dict[str, Any]) -> str:
         ("settings", f"preset `{settings['preset']}`, seed {settings['seed']}"),
         ("patches", f"{settings['batch']} of {_sides(training)} pixels per iteration"),
         ("octaves", f"{settings['octaves']}, span {settings['octave_span']:g}"),
-        ("slices", turned(Planes(settings["grain"], settings.get("upright", False)))),
+        ("slices", turned(planes_in(settings))),
         ("iterations", f"{training['iterations']:,}"),
         ("minutes", f"{training['minutes']:g}"),
         ("trained by", f"solidgrain {training['revision']}"),
@@ -39,6 +39,11 @@ def write_card(name: str, training: dict[str, Any]) -> str:
     kind = "A space of solid textures" if settings.get("latent") else "A solid texture"
     lines = [f"# {name}", "", f"{kind}, trained on:", "", *exemplars, "", "| | |", "|---|---|"]
     return "\n".join([*lines, *(f"| {label} | {value} |" for label, value in rows), ""])
+
+
+def planes_in(settings: dict[str, Any]) -> Planes:
+    """The planes that a training sliced, by the settings of any version, or of none."""
+    return Planes(settings.get("grain", "none"), settings.get("upright", False))
 
 
 def turned(planes: Planes) -> str:

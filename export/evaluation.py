@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from solidgrain.export.card import with_quality
+from solidgrain.export.card import planes_in, with_quality
 from solidgrain.export.figures import Figures, make_figures
 from solidgrain.runtime import Texture
 from solidgrain.runtime.bundle import CARD, Bundle
@@ -39,8 +39,7 @@ class Measured(NamedTuple):
 
 def planes_of(bundle: Bundle) -> Planes:
     """The planes that training saw."""
-    settings = bundle.manifest["training"].get("settings", {})
-    return Planes(str(settings.get("grain", "none")), bool(settings.get("upright", False)))
+    return planes_in(bundle.manifest["training"].get("settings", {}))
 
 
 def exemplar_of(bundle: Bundle) -> dict[str, str]:

@@ -18,7 +18,7 @@ from solidgrain.runtime.files import replacing
 from solidgrain.train.exemplar import FloatArray, middle
 from solidgrain.train.noise import draw_noise
 from solidgrain.train.settings import Settings
-from solidgrain.train.slices import Planes, flat_slice
+from solidgrain.train.slices import flat_slice, planes_seen
 
 Model = Callable[..., Tensor]  # noise, points and what else it needs -> colours
 Pixels = npt.NDArray[np.uint8]  # [H, W, 3]
@@ -34,7 +34,7 @@ def render_slices(model: Model, settings: Settings, device: torch.device, *condi
     """
     generator = torch.Generator(device).manual_seed(7)
     noise = draw_noise(settings.octaves, settings.resolution, generator)
-    oblique = Planes(settings.grain, settings.upright).example().to(device)
+    oblique = planes_seen(settings).example().to(device)
     flat = flat_slice(SIZE, device)
     slices = [model(noise, points[None], *conditions).reshape(SIZE, SIZE, 3) for points in (flat, flat @ oblique.T)]
     image: FloatArray = torch.cat(slices, 1).clamp(0, 1).cpu().numpy()

@@ -50,6 +50,11 @@ class Planes(NamedTuple):
 ALL_PLANES = Planes()
 
 
+def planes_seen(settings: Settings) -> Planes:
+    """Those that a training slices."""
+    return Planes(settings.grain, settings.upright)
+
+
 def draw_slices(settings: Settings, generator: torch.Generator) -> Tensor:
     """Points of `batch` randomly turned and shifted planes, [B, patch², 3], rows of the image first."""
     flat = flat_slice(settings.patch, generator.device)
@@ -82,7 +87,7 @@ def draw_rotations(settings: Settings, generator: torch.Generator) -> Tensor:
     The paper asks for "all possible slice orientations"; its code draws three Euler angles from [0°, 90°], which favours
     some. "axis" is what Henzler et al. (2020) do.
     """
-    batch, device, planes = settings.batch, generator.device, Planes(settings.grain, settings.upright)
+    batch, device, planes = settings.batch, generator.device, planes_seen(settings)
     if settings.rotations == "axis":
         rotations = planes.along_axes().to(device)
         return rotations[torch.randint(len(rotations), (batch,), generator=generator, device=device)]

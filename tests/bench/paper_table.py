@@ -28,7 +28,7 @@ from solidgrain.train.inception import Inception
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import evaluate
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings
-from solidgrain.train.slices import Planes
+from solidgrain.train.slices import Planes, planes_seen
 from solidgrain.train.variants import vary
 from tests.bench import cells
 
@@ -103,7 +103,7 @@ def finish_cell(
 ) -> None:
     """Train and measure one method on one exemplar, unless that was done before."""
     settings = with_grain(COLUMNS[column], "auto" if folder.name == "wood" else None, exemplar)
-    planes = Planes(settings.grain, settings.upright)
+    planes = planes_seen(settings)
 
     def measured(sample: Sample) -> dict[str, Any]:
         cells.write_png(folder / f"{column}.png", slice_picture(sample, planes))

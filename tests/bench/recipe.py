@@ -34,7 +34,7 @@ from solidgrain.train.inception import Inception
 from solidgrain.train.photograph import read_exemplar
 from solidgrain.train.quality import evaluate
 from solidgrain.train.settings import FAST, PAPER, Budget, Settings
-from solidgrain.train.slices import Planes
+from solidgrain.train.slices import planes_seen
 from tests.bench import cells, curves
 
 DEFAULTS = [  # the embedded critic, which FAST starts from, has seen none of them
@@ -173,7 +173,7 @@ def finish_mark(
     """Train one row on one exemplar until a mark, and measure, unless that was done before."""
     result = folder.with_name(f"{folder.name}-{mark:g}.json")
     budget = Budget(minutes=mark) if by == "minutes" else Budget(iterations=round(mark))
-    planes = Planes(settings.grain, settings.upright)
+    planes = planes_seen(settings)
 
     def measured(sample: Sample) -> dict[str, Any]:
         return {"quality": asdict(evaluate(exemplar, sample, slices, planes, inception))}
