@@ -66,6 +66,13 @@ def parse_positive(text: str) -> int:
     return int(text)
 
 
+def parse_axis(text: str) -> str:
+    """Of an image, along which a grain runs. A flag whose value may be missing takes whatever follows it."""
+    if text not in ("auto", "x", "y"):
+        raise argparse.ArgumentTypeError(f"expected auto, x or y, found {text!r}; put what is no axis before the flag")
+    return text
+
+
 def parse_minutes(text: str) -> float:
     return _duration(text, "minutes")
 

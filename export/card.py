@@ -13,17 +13,17 @@ MANY = 8  # exemplars that get a line each
 def write_card(name: str, training: dict[str, Any]) -> str:
     """The card of a bundle, from its manifest's training record."""
     settings = training["settings"]
+    start = settings.get("warm_start") or settings.get("sampler_start")
     rows = [
-        ("settings", f"preset `{settings['preset']}`, seed {settings['seed']}"),
+        ("settings", f"preset `{settings['preset']}`{_variant(settings)}, seed {settings['seed']}"),
         ("patches", f"{settings['batch']} of {_sides(training)} pixels per iteration"),
-        ("octaves", f"{settings['octaves']}, span {settings['octave_span']:g}"),
+        ("octaves", f"{settings['octaves']}" + (f", span {settings['octave_span']:g}" if not start else "")),
+        *_beginning(start, settings.get("critic_start")),
         ("slices", turned(planes_in(settings))),
         ("iterations", f"{training['iterations']:,}"),
         ("minutes", f"{training['minutes']:g}"),
         ("trained by", f"solidgrain {training['revision']}"),
     ]
-    if start := settings.get("warm_start") or settings.get("sampler_start"):
-        rows.insert(4, ("began as", f"`{start}`, whose iterations are not counted here"))
     exemplars = (
         _grouped(training["exemplars"])
         if len(training["exemplars"]) > MANY
@@ -50,8 +50,21 @@ def turned(planes: Planes) -> str:
     """How training turned its slices, in words."""
     if planes.grain == "none":
         return "turned freely"
-    across = "xz" if planes.grain == "x" else "zy"
+    across = "xz" if planes.grain == "x" else "zy (z to the left)"
     return f"turned about the {planes.grain} axis only" + f", upright, from xy to {across}" * planes.upright
+
+
+def _variant(settings: dict[str, Any]) -> str:
+    """Which of the paper's comparisons it was, if not the method itself."""
+    variant = settings.get("variant", "paper")
+    return "" if variant == "paper" else f", variant `{variant}`"
+
+
+def _beginning(start: str | None, critic: str | None) -> list[tuple[str, str]]:
+    """What the sampler's weights began as, or at least the critic's."""
+    if start:
+        return [("began as", f"`{start}`, whose iterations are not counted here")]
+    return [("critic began as", f"that of `{critic}`")] if critic else []
 
 
 def _sides(training: dict[str, Any]) -> str:

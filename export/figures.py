@@ -50,7 +50,10 @@ def make_figures(evaluation: Evaluation, copying: Copying) -> Figures:
         after.append(f"The exemplar changes across itself (nonstationarity {figure}).")
     if evaluation.symmetry > MIRRORED:
         figure = f"{evaluation.symmetry:.2f}, above {MIRRORED}"
-        after.append(f"The exemplar is its own mirror image (symmetry about its middle {figure}): one side of it was compared.")
+        said = (
+            "one side of it was compared" if evaluation.one_side else "its floor is between mirror images; use one side of it"
+        )
+        after.append(f"The exemplar is its own mirror image (symmetry about its middle {figure}): {said}.")
     return Figures(
         f"Distances to the exemplar over its own floor, mean ± standard deviation over {evaluation.slices} slices of "
         f"{evaluation.crop}² pixels, through the runtime:",

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from solidgrain.runtime.errors import ExemplarError
-from solidgrain.train.exemplar import FloatArray, flip_by_chance, uniform_below
+from solidgrain.train.exemplar import FRAMED, FloatArray, edge_step, flip_by_chance, uniform_below
 from solidgrain.train.photograph import SUFFIXES, read_photograph
 from solidgrain.train.settings import Settings
 
@@ -116,7 +116,12 @@ def mean_covariance(members: Sequence[Member]) -> Tensor:
 
 
 def wraps(exemplar: FloatArray) -> tuple[bool, bool]:
-    """Whether an image [H, W, 3] continues across its lower and its right edge: the step there is like any other."""
+    """Whether an image [H, W, 3] continues across its lower and its right edge: the step there is like any other.
+
+    Opposite edges of a frame are alike, and what is inside does not continue.
+    """
+    if edge_step(exemplar) > FRAMED:
+        return False, False
     return (_continues(exemplar), _continues(exemplar.swapaxes(0, 1)))
 
 

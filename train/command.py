@@ -8,7 +8,15 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from solidgrain.bake.arguments import parse_count, parse_minutes, parse_positive, parse_scale, parse_seed, parse_text
+from solidgrain.bake.arguments import (
+    parse_axis,
+    parse_count,
+    parse_minutes,
+    parse_positive,
+    parse_scale,
+    parse_seed,
+    parse_text,
+)
 from solidgrain.bake.messages import tell
 from solidgrain.runtime.errors import TrainingError
 from solidgrain.train.console import Progress, StopRequest
@@ -48,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--anisotropic",
         nargs="?",
         const="auto",
-        choices=("auto", "x", "y"),
+        type=parse_axis,
         metavar="AXIS",
         help="oriented material: slices turn about the grain, image axis x or y (measured if not given)",
     )

@@ -55,7 +55,7 @@ class Pair(NamedTuple):
 def measure_copying(exemplar: FloatArray, sample: Sample, planes: Planes = ALL_PLANES) -> tuple[Copying, list[Pair]]:
     """Compare patches of a texture with their nearest in the exemplar, and return the nearest pairs of all as well.
 
-    The search is exhaustive: every place in the exemplar, in each orientation in which training may have shown it. The
+    The search is exhaustive: every place in the exemplar, flipped, and transposed where it has no grain. The
     floor of what was mirrored to tile is that of one side: its halves hold the same.
     """
     image, side = as_image(exemplar), as_image(unfolded(exemplar, 2 * SIDE))

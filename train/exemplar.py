@@ -18,7 +18,8 @@ NONSTATIONARY = 0.3  # above it, one texture cannot describe the image (docs/tra
 INWARDS = 10  # steps that an edge's own is held against
 FRAMED = 3.0  # `edge_step` above which an image has a frame: photographs of stones without one come to 2.5 at most
 OFF = 3  # pixels by which cropping may have moved the middle about which an image was mirrored
-MIRRORED = 0.6  # `mirror_symmetry` above which an image was mirrored to tile (docs/training.md)
+ELSEWHERE = (16, 128)  # twice as many pixels from there are other places that what repeats itself is symmetric about
+MIRRORED = 0.1  # `mirror_symmetry` above which an image was mirrored to tile (docs/training.md)
 
 
 def draw_patches(exemplar: Tensor, settings: Settings, generator: torch.Generator) -> Tensor:
@@ -73,7 +74,7 @@ def edge_step(exemplar: FloatArray) -> float:
 
 
 def mirror_symmetry(exemplar: FloatArray) -> float:
-    """How nearly the exemplar is its own mirror image about one of its middles: 1 where it was mirrored to tile."""
+    """How nearly the exemplar is its own mirror image about one of its middles, up to 1 where it was mirrored to tile."""
     return max(_symmetry(exemplar, axis) for axis in (0, 1))
 
 
@@ -89,12 +90,20 @@ def unfolded(exemplar: FloatArray, smallest: int) -> FloatArray:
 
 
 def _symmetry(exemplar: FloatArray, axis: int) -> float:
-    """The correlation of the steps along an axis with the same backwards: what runs along the axis has none."""
+    """How alike rows of steps along an axis are on both sides of the middle, beyond how alike they are about other places.
+
+    Steps are compared backwards; each row counts as much as any other, or the two ends of a frame would decide. What repeats
+    itself is its own mirror image about many places.
+    """
     steps = np.diff(np.moveaxis(middle(exemplar, CORRELATED).mean(-1), axis, 0), axis=0)
-    back, energy = -steps[::-1], max(float((steps**2).sum()), 1e-6)
-    ahead = [float((steps[off:] * back[: len(back) - off]).sum()) for off in range(OFF + 1)]
-    behind = [float((steps[: len(steps) - off] * back[off:]).sum()) for off in range(1, OFF + 1)]
-    return max(ahead + behind) / energy
+    steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-4)
+    alike, count = -np.fliplr(steps @ steps.T), len(steps)
+
+    def about(off: int) -> float:
+        return float(alike.trace(off)) / (count - abs(off))
+
+    elsewhere = [about(sign * off) for off in range(ELSEWHERE[0], min(ELSEWHERE[1], count // 2)) for sign in (-1, 1)]
+    return max(map(about, range(-OFF, OFF + 1))) - max(elsewhere, default=0.0)
 
 
 def middle(exemplar: FloatArray, largest: int) -> FloatArray:

@@ -54,7 +54,8 @@ class Evaluation:
     oblique: dict[str, tuple[float, float]]
     turned: Measures  # the exemplar itself, as `turn` says: far above 1 where it has a direction
     nonstationarity: float = 0.0  # of the exemplar
-    symmetry: float = 0.0  # of the exemplar about its middle: above `MIRRORED`, one side of it stands for all
+    symmetry: float = 0.0  # of the exemplar about its middle
+    one_side: bool = False  # of an exemplar that was mirrored there was compared, rather than all of it
     grain: str = "none"  # the image axis about which slices turn
     upright: bool = False  # by a quarter at most
     among: Measures = field(default_factory=dict)  # each oblique slice from the next: at 1 they vary as the exemplar's parts do
@@ -70,12 +71,13 @@ def evaluate(
 ) -> Evaluation:
     """Measure axis-aligned and oblique slices of a texture, one of each per seed, against its exemplar.
 
-    Slices are taken in those planes alone that training saw. Of an exemplar that was mirrored to tile one side is compared, for
-    a floor is not between mirror images.
+    Slices are taken in those planes alone that training saw. Of an exemplar that was mirrored to tile one side is compared, if
+    it is large enough: a floor is not between mirror images.
     Raises ExemplarError if the exemplar's parts are all the same: there is no floor then.
     """
     measure = Measure(inception)
-    image = as_image(unfolded(exemplar, SMALLEST))
+    part = unfolded(exemplar, SMALLEST)
+    image = as_image(part)
     size = min(image.shape[2] // 2, image.shape[3] // 2, LARGEST_CROP)
     squares = [square.pixels for square in spread_out(distinct(disjoint_crops(image, size)), COMPARED)]
     crops = [measure.statistics(square) for square in squares]
@@ -83,7 +85,8 @@ def evaluate(
     if floor["color"] < SMALLEST_FLOOR:
         raise ExemplarError(
             f"the exemplar has the same colours in each of its squares of {size}² pixels, so that nothing tells how far apart "
-            "its own parts are; expected a photograph that neither repeats itself nor is of one colour, or one period of it"
+            "its own parts are; expected a photograph that neither repeats nor mirrors itself nor is of one colour, or one "
+            "side or one period of it"
         )
     others = [measure.statistics(turned_as_slices_are(square, planes.grain)) for square in squares]
     turned = _mean(measure.distances(a, b) for i, a in enumerate(crops) for j, b in enumerate(others) if i != j)
@@ -102,6 +105,7 @@ def evaluate(
         turned={name: turned[name] / floor[name] for name in floor},
         nonstationarity=nonstationarity(exemplar),
         symmetry=mirror_symmetry(exemplar),
+        one_side=part is not exemplar,
         grain=planes.grain,
         upright=planes.upright,
         among=among,

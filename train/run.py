@@ -202,7 +202,7 @@ def creating(folder: Path) -> Iterator[None]:
             (folder / SAMPLES).mkdir(parents=True, exist_ok=True)
             yield
     except OSError as error:
-        raise TrainingError(f"{folder}: cannot write the run directory ({error.strerror})") from error
+        raise TrainingError(f"{folder}: cannot write the run directory ({error.strerror or error})") from error
 
 
 @contextmanager

@@ -20,7 +20,7 @@ class Planes(NamedTuple):
 
     Among the latter a plane that is turned by 180° is the same one seen from behind, the photograph's mirror image. Of what is
     not its own mirror image, as where light falls from one side, those look like it that are `upright`: from xy to xz, or from
-    xy to zy, where the grain runs along y. The authors' code draws its angles from such a quarter, too.
+    xy to zy with z to the left, where the grain runs along y. The authors' code draws its angles from such a quarter, too.
     """
 
     grain: str = "none"  # "none", "x" or "y"

@@ -53,7 +53,7 @@ class Watch:
         for name, lowest in self.lowest.items():
             mean, latest = (math.exp(magnitudes[name] - lowest) for magnitudes in (self.means, self.latest))
             if mean > LIMIT or latest > SPIKE:
-                return f"{name} is {latest:.0f} times its lowest mean, too high for {self.beyond} iterations"
+                return f"{name} is {max(mean, latest):.0f} times its lowest mean, too high for {self.beyond} iterations"
         return ""
 
     def state(self) -> dict[str, Any]:

@@ -50,6 +50,11 @@ def test_images_that_tile_are_recognised_axis_by_axis(tiles):
     assert [wraps(picture(140, 180, seed, tiles)) for seed in range(5)] == 5 * [tiles]
 
 
+def test_what_has_a_frame_does_not_tile():
+    framed = np.pad(0.4 + 0.2 * picture(140, 180, 0, (True, True)), ((3, 3), (3, 3), (0, 0)))
+    assert wraps(framed) == (False, False)
+
+
 def places(member, count=100, size=64):
     """Rows and columns [count, size] of random crops."""
     draw = generator()

@@ -233,6 +233,12 @@ def test_a_loss_beyond_its_limit_for_long_enough_is_a_divergence(of):
     found = verdicts(losses_of["L_style"], losses_of["L_D"])
     assert not any(found[: 300 + PATIENCE - 1])
     assert found[-1].startswith(of)
+    assert int(found[-1].split(" times its lowest mean")[0].split()[-1]) >= LIMIT
+
+
+def test_what_is_said_of_a_loss_is_what_was_beyond_its_limit():
+    said = next(filter(None, verdicts([0.1] * 100 + [10 * LIMIT] * (PATIENCE - 1) + [0.5])))
+    assert int(said.split("L_style is ")[1].split(" times")[0]) > LIMIT
 
 
 def test_a_loss_that_comes_back_in_time_is_no_divergence():
@@ -242,7 +248,8 @@ def test_a_loss_that_comes_back_in_time_is_no_divergence():
 
 def test_a_slow_explosion_is_noticed_too():
     styles = [0.13 * math.exp(max(0, k - 200) / 66) for k in range(800)]  # to 1000 times, over 600 iterations
-    assert any(verdicts(styles))
+    said = next(filter(None, verdicts(styles)))
+    assert int(said.split("L_style is ")[1].split(" times")[0]) > LIMIT
 
 
 @torch.no_grad()

@@ -253,12 +253,11 @@ def test_a_frame_is_a_step_near_an_edge_that_nothing_beside_it_comes_near(width)
 @pytest.mark.parametrize("cropped", [0, 1, 3])
 def test_a_mirrored_photograph_is_unfolded_to_one_side(cropped):
     side = blotches(90, 130)
-    assert mirror_symmetry(side) < 0.3
     assert unfolded(side, 32) is side
     once = np.concatenate([side, side[:, ::-1]], axis=1)[:, cropped:]
     twice = np.concatenate([once, once[::-1]], axis=0)[cropped:]
     for mirrored, shape in ((once, (90, 130 - 2)), (twice, (90 - 2, 130 - 2))):
-        assert mirror_symmetry(mirrored) > 0.9 > MIRRORED
+        assert mirror_symmetry(mirrored) > 2 * MIRRORED
         found = unfolded(mirrored, 32)
         np.testing.assert_allclose(found.shape[:2], shape, atol=2)
         np.testing.assert_array_equal(found, mirrored[: found.shape[0], : found.shape[1]])
@@ -271,26 +270,37 @@ def test_what_was_mirrored_twice_is_unfolded_twice_but_not_below_the_smallest():
     assert unfolded(mirrored, 90).shape == (80, 158, 3)
 
 
-@pytest.mark.parametrize("rows", [True, False])
-def test_a_grain_is_no_mirror_image(rows):
-    stripes = np.random.default_rng(0).random((96, 1, 1), np.float32) + 0.3 * blotches(96, 96)
-    assert mirror_symmetry(stripes if rows else stripes.transpose(1, 0, 2)) < 0.4
+def no_mirror_images():
+    rows = np.random.default_rng(0).random((96, 1, 1), np.float32) + 0.3 * blotches(96, 96)
+    weave = np.add.outer(*2 * [np.sin(2 * np.pi / 7 * np.arange(160))])[..., None] + 0.1 * blotches(160, 160)
+    return {
+        "even": blotches(90, 130),
+        "rows": rows,
+        "columns": rows.transpose(1, 0, 2),
+        "framed": np.pad(0.4 + 0.2 * blotches(90, 90), ((4, 4), (4, 4), (0, 0)), constant_values=1),
+        "weave": weave.astype(np.float32),
+        "plain": np.full((96, 96, 3), 0.5, np.float32),
+    }
 
 
-def test_of_one_colour_there_is_nothing_to_mirror():
-    plain = np.full((96, 96, 3), 0.5, np.float32)
-    assert mirror_symmetry(plain) == 0
-    assert unfolded(plain, 32) is plain
+@pytest.mark.parametrize("kind", no_mirror_images())
+def test_what_only_looks_alike_on_both_sides_is_no_mirror_image(kind):
+    exemplar = no_mirror_images()[kind]
+    assert mirror_symmetry(exemplar) < MIRRORED
+    assert unfolded(exemplar, 32) is exemplar
 
 
-def test_photographs_are_no_mirror_images_and_their_halves_beside_their_own_are(exemplars, tmp_path):
-    """Of stones, woods and rusts, as a JPEG of quality 75: no figure of either is near the limit."""
-    natural, mirrored = {}, {}
+def test_photographs_are_no_mirror_images_framed_or_not_and_their_halves_beside_their_own_are(exemplars, tmp_path):
+    """Of stones, woods and rusts, mirrored ones as a JPEG of quality 75, which leaves little of a faint wood."""
+    natural, mirrored = [], []
     for photograph in sorted(exemplars.glob("*128/*.png")):
         pixels = read_exemplar(photograph, 64)
         half = pixels[:, : pixels.shape[1] // 2]
         tile = write(tmp_path / "tile.jpg", np.concatenate([half, half[:, ::-1]], axis=1), compression="jpeg:75")
-        natural[photograph.stem], mirrored[photograph.stem] = mirror_symmetry(pixels), mirror_symmetry(read_exemplar(tile, 64))
-    assert len(natural) > 200
-    assert max(natural.values()) < 0.4
-    assert min(mirrored.values()) > 0.7
+        framed = np.pad(pixels[2:-2, 2:-2], ((2, 2), (2, 2), (0, 0)), constant_values=1)
+        natural += [mirror_symmetry(pixels), mirror_symmetry(framed)]
+        mirrored.append(mirror_symmetry(read_exemplar(tile, 64)))
+    assert len(mirrored) > 200
+    assert max(natural) < 0.5 * MIRRORED
+    assert [figure > MIRRORED for figure in mirrored].count(False) <= 1
+    assert [figure > 3 * MIRRORED for figure in mirrored].count(False) <= 3

@@ -21,6 +21,7 @@ from solidgrain.runtime import ExemplarError, load_space
 from solidgrain.runtime.bundle import embedded_folder
 from solidgrain.train import quality
 from solidgrain.train.copying import Copying
+from solidgrain.train.exemplar import MIRRORED
 from solidgrain.train.quality import Evaluation, disjoint_crops, distinct, evaluate, spread_out
 from solidgrain.train.slices import Planes
 from tests.bench import cells
@@ -223,7 +224,7 @@ def test_a_card_is_not_that_of_one_texture_of_a_space(solidgrain, toy_space_fold
 
 @pytest.mark.parametrize("exemplar", [np.tile(EXEMPLAR[:64, :64], (2, 2, 1)), np.full((128, 128, 3), 0.5, np.float32)])
 def test_what_has_no_floor_is_refused(exemplar):
-    with pytest.raises(ExemplarError, match="one period of it"):
+    with pytest.raises(ExemplarError, match="one side or one period of it"):
         evaluate(exemplar, resampled, slices=1)
 
 
@@ -246,10 +247,18 @@ def test_one_side_of_a_mirrored_exemplar_is_compared():
     mirrored = np.concatenate([EXEMPLAR, EXEMPLAR[:, ::-1]], axis=1)
     side = np.ascontiguousarray(mirrored[:, : (mirrored.shape[1] - 3) // 2])
     whole, part = (evaluate(one, resampled, slices=1) for one in (mirrored, side))
-    assert whole.symmetry > 0.9
-    assert part.symmetry < 0.6
+    assert (whole.one_side, part.one_side) == (True, False)
+    assert whole.symmetry > MIRRORED > part.symmetry
     assert whole.floor == part.floor
-    assert "is its own mirror image (symmetry about its middle 0.94, above 0.6): one side" in said_after(symmetry=0.94)
+    assert "(symmetry about its middle 0.94, above 0.1): one side of it was" in said_after(symmetry=0.94, one_side=True)
+    assert "(symmetry about its middle 0.94, above 0.1): its floor is between mirror" in said_after(symmetry=0.94)
+
+
+def test_of_a_small_mirrored_exemplar_no_side_is_compared():
+    half = EXEMPLAR[:, :64]
+    found = evaluate(np.concatenate([half, half[:, ::-1]], axis=1), resampled, slices=1)
+    assert found.symmetry > MIRRORED
+    assert not found.one_side
 
 
 def test_flags_for_an_exemplar_with_a_direction_are_named_where_slices_lack_it():
