@@ -62,7 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--card: {texture.bundle.name} is a space, its card not that of one texture; leave --card out")
     scale = arguments.patch_scale or exemplar_scale(texture)
     smaller = "use a larger photograph or a smaller --patch-scale"
-    photograph = read_photograph(arguments.exemplar, round(SMALLEST * scale), smaller).pixels
+    photograph, _, warning = read_photograph(arguments.exemplar, round(SMALLEST * scale), smaller)
+    if warning:
+        warn(f"{arguments.exemplar}: {warning}")
     if not texture.bundle.is_space and not is_exemplar(texture.bundle, photograph):
         if arguments.card:
             raise UsageError(

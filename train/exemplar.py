@@ -18,7 +18,7 @@ NONSTATIONARY = 0.3  # above it, one texture cannot describe the image (docs/tra
 INWARDS = 10  # steps that an edge's own is held against
 FRAMED = 3.0  # `edge_step` above which an image has a frame: photographs of stones without one come to 2.5 at most
 OFF = 3  # pixels by which cropping may have moved the middle about which an image was mirrored
-ELSEWHERE = (16, 128)  # twice as many pixels from there are other places that what repeats itself is symmetric about
+ELSEWHERE = (16, 128)  # likewise: other places, which what repeats itself is symmetric about, too
 MIRRORED = 0.1  # `mirror_symmetry` above which an image was mirrored to tile (docs/training.md)
 
 
