@@ -55,8 +55,8 @@ class Pair(NamedTuple):
 def measure_copying(exemplar: FloatArray, sample: Sample, planes: Planes = ALL_PLANES) -> tuple[Copying, list[Pair]]:
     """Compare patches of a texture with their nearest in the exemplar, and return the nearest pairs of all as well.
 
-    The search is exhaustive: every place in the exemplar, flipped, and transposed where it has no grain. The
-    floor of what was mirrored to tile is that of one side: its halves hold the same.
+    The search is exhaustive: every place in the exemplar, flipped, and transposed where it has no grain. The floor of what
+    was mirrored to tile is that of one side: its halves hold the same.
     """
     image, side = as_image(exemplar), as_image(unfolded(exemplar, 2 * SIDE))
     count = min(MOST, max(FEWEST, MOST * 2**18 // (image.shape[2] * image.shape[3]))) // SLICES * SLICES

@@ -102,8 +102,9 @@ def _symmetry(exemplar: FloatArray, axis: int) -> float:
     def about(off: int) -> float:
         return float(alike.trace(off)) / (count - abs(off))
 
-    elsewhere = [about(sign * off) for off in range(ELSEWHERE[0], min(ELSEWHERE[1], count // 2)) for sign in (-1, 1)]
-    return max(map(about, range(-OFF, OFF + 1))) - max(elsewhere, default=0.0)
+    nearest, furthest = min(ELSEWHERE[0], count // 4), min(ELSEWHERE[1], count // 2)
+    elsewhere = max(about(sign * off) for off in range(nearest, furthest) for sign in (-1, 1))
+    return max(map(about, range(-OFF, OFF + 1))) - elsewhere
 
 
 def middle(exemplar: FloatArray, largest: int) -> FloatArray:
