@@ -49,10 +49,10 @@ share of patches that come closer than 99 % of the photograph's own. [What is me
 Looked at, in slices and in what was cut out: no streaks, no grid, no direction that a photograph does not have. Missing are
 outlines of a pixel's width: the plates of the lava, the flakes of the chipboard, leaves of the moss, veins of the marble,
 stones of the gravel and of the asphalt. Some edges of the lava are olive, some specks of asphalt and gravel a shade bluer than
-they should be, some of the moss more violet.
-Light falls on the dirt as on its photograph in the planes from xy to xz, and from elsewhere in others. Of granite-pink, gravel,
-marble and wood more patches come close than chance gives; the closest of the gravel are plain grey ones. The photographs
-of granite, granite-pink, gravel, lichen and marble are among the eighty stones of `stone`, as which trainings begin."""
+they should be, some of the moss more violet. Light falls on the dirt as on its photograph in the planes from xy to xz, and from
+elsewhere in others. Of granite-pink, gravel, marble and wood more patches come close than chance gives; the closest of the
+gravel are plain grey ones. The photographs of granite, granite-pink, gravel, lichen and marble are among the eighty stones of
+`stone`, as which trainings begin."""
 HEADER = ("texture", "photograph", "licence", "credit", "axis-aligned", "oblique", "copying")
 
 

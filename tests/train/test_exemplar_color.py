@@ -187,6 +187,13 @@ def test_a_profile_that_cannot_be_honoured_is_told_and_the_colours_are_taken_as_
     np.testing.assert_allclose(photograph.pixels, rgb, atol=1e-7)
 
 
+def test_evaluate_tells_it_too(tmp_path, solidgrain, toy_folder):
+    photograph = write(tmp_path / "a.tif", pixels(), icc=profile(REC709, gamma_curve(2.2), space=b"CMYK"))
+    outcome = solidgrain("evaluate", toy_folder, "--exemplar", photograph, "--slices", 1, "--threads", 1)
+    assert outcome.code == 0
+    assert f"warning: {photograph}: its ICC profile is of CMYK colours, expected RGB" in outcome.err
+
+
 @pytest.mark.parametrize(
     ("chunks", "linear", "primaries"),
     [
